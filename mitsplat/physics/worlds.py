@@ -42,10 +42,12 @@ CONTACT_TIME, DAMPING_RATIO = 0.004, 1.5
 CONTACT_STIFFNESS, CONTACT_DAMPING = 1 / (CONTACT_TIME * DAMPING_RATIO) ** 2, 2 / CONTACT_TIME
 # Contact dimensions: normal, two sliding, spin, and two rolling.
 WITH_ROLL, _WITHOUT_ROLL = 6, 4
-# Impedance of contacts at the surface and 1 mm deep: at MuJoCo's default of 0.9, a nut under a plate of a hundred times
-# its mass sinks by 1 mm. MuJoCo's own contacts flicker when stiffer: from 0.98 on, a pile of 29 packages creeps at 1 to
-# 10 mm/s, and another one at 2 to 4 mm/s at 0.97. At 0.96 such piles rest sooner, and friction is still exact to 0.3 %.
-IMPEDANCE_WARP, IMPEDANCE_MUJOCO = (0.996, 0.9999), (0.96, 0.999)
+# Impedance of contacts as MuJoCo's solimp: at the surface, from a depth [m] on, that depth, and the curve between. At
+# MuJoCo's default of 0.9, a nut under a plate of a hundred times its mass sinks by 1 mm. MuJoCo's own contacts flicker
+# when stiffer: from 0.98 on, a pile of 29 packages creeps at 1 to 10 mm/s, and another one at 2 to 4 mm/s at 0.97. At
+# 0.96 such piles rest sooner, and friction is still exact to 0.3 %. Contacts under load are deeper, and stiff from
+# 0.3 mm on: with 1 mm, a bolt under a plate of a hundred times its mass sinks by 0.5 mm.
+IMPEDANCE_WARP, IMPEDANCE_MUJOCO = (0.996, 0.9999, 1e-3, 0.5, 2.0), (0.96, 0.999, 3e-4, 0.5, 2.0)
 # Moment of inertia below which Newton corrects it [kg m^2], below that of any part of 0.5 mm. By default, Newton adds
 # 1e-6 kg m^2 to moments below 1e-10, which a steel cube of 2 mm has.
 _MIN_INERTIA = 1e-20
@@ -439,20 +441,20 @@ def max_contacts(bodies: int, shapes: int) -> int:
 
 
 def _build_model(
-    bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float], newton_contacts: bool
+    bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, ...], newton_contacts: bool
 ) -> newton.Model:
     return build_scene(bodies, colliders, impedance, newton_contacts).finalize(device="cpu")
 
 
 def build_scene(
-    bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, float], newton_contacts: bool
+    bodies: Sequence[Body], colliders: Sequence[Collider], impedance: tuple[float, ...], newton_contacts: bool
 ) -> newton.ModelBuilder:
     """Build a scene for Newton's contacts, or else for those of MuJoCo.
 
     Newton analyses convex hulls for its contacts, which takes as long as all other steps. MuJoCo makes the hulls of
     meshes itself.
     """
-    contact = {"mujoco:condim": WITH_ROLL, "mujoco:geom_solimp": (*impedance, 1e-3, 0.5, 2.0)}
+    contact = {"mujoco:condim": WITH_ROLL, "mujoco:geom_solimp": impedance}
     builder = newton.ModelBuilder(gravity=GRAVITY_VECTOR)
     builder.validate_inertia_detailed = True  # in Python: the alternative compiles a kernel for 4 s
     builder.inertia_absolute_tolerance = builder.inertia_correction = _MIN_INERTIA

@@ -106,9 +106,8 @@ class _ModelWriter:
         option.attrib.update({"integrator": "implicitfast", "cone": "elliptic", "solver": "Newton"})
         ET.SubElement(option, "flag", multiccd="enable")
         default = ET.SubElement(root, "default")
-        impedance = (*IMPEDANCE_MUJOCO, 1e-3, 0.5, 2.0)
         reference = (CONTACT_TIME, DAMPING_RATIO)
-        ET.SubElement(default, "geom", solref=_text(reference), solimp=_text(impedance), condim=str(WITH_ROLL))
+        ET.SubElement(default, "geom", solref=_text(reference), solimp=_text(IMPEDANCE_MUJOCO), condim=str(WITH_ROLL))
         root.append(self._meshes)
         custom, world = ET.Element("custom"), ET.SubElement(root, "worldbody")
         if content.environment is not None and content.environment.mesh is not None:

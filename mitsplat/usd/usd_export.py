@@ -307,7 +307,7 @@ class _StageWriter:
         prim.CreateAttribute("mjc:condim", Sdf.ValueTypeNames.Int, custom=True).Set(WITH_ROLL)
         for name in ("contactMargin", "contactGap"):  # the gap of Newton's default moves objects at rest
             prim.CreateAttribute(f"newton:{name}", Sdf.ValueTypeNames.Float, custom=True).Set(0.0)
-        impedance = Vt.DoubleArray([*IMPEDANCE_MUJOCO, 1e-3, 0.5, 2.0])
+        impedance = Vt.DoubleArray(IMPEDANCE_MUJOCO)
         prim.CreateAttribute("mjc:solimp", Sdf.ValueTypeNames.DoubleArray, custom=True).Set(impedance)
 
     def _camera(self, camera: Camera) -> None:

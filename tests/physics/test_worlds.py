@@ -145,20 +145,40 @@ def test_worlds_in_one_simulation_do_not_interact():
     assert (second.poses[:, 2, 3] > 0.009).all()
 
 
-def test_light_parts_carry_a_plate_a_hundred_times_as_heavy():
-    """A plate a hundred times as heavy rests on two nuts, which sink by at most 0.1 mm."""
+@pytest.mark.parametrize(("stepper", "depth"), [("warp", 1e-4), ("mujoco", 2e-4)])
+def test_light_parts_carry_a_plate_a_hundred_times_as_heavy(stepper, depth):
+    """A plate a hundred times as heavy rests on two nuts. Its contacts and theirs are at most as deep as stated."""
     from mitsplat.physics.rest import run_to_rest
 
     nut, plate = trimesh.creation.box((0.01, 0.01, 0.005)), trimesh.creation.box((0.15, 0.05, 0.0135))
     bodies = [body_of(nut), body_of(nut), body_of(plate)]
     assert bodies[2].mass.mass > 100 * bodies[0].mass.mass
     poses = [pose_at((-0.05, 0, 0.003)), pose_at((0.05, 0, 0.003)), pose_at((0, 0, 0.014))]
-    world = world_of("warp", bodies, [table()], poses)
+    world = world_of(stepper, bodies, [table()], poses)
     outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE)
     assert outcome.rejection == ""
-    assert [lowest(mesh, pose) for mesh, pose in zip((nut, nut, plate), outcome.poses, strict=True)] == pytest.approx(
-        [0.0, 0.0, 0.005], abs=1e-4
-    )
+    first, second, above = (lowest(mesh, pose) for mesh, pose in zip((nut, nut, plate), outcome.poses, strict=True))
+    assert [first, second] == pytest.approx([0.0, 0.0], abs=depth)
+    assert above == pytest.approx((first + second) / 2 + 0.005, abs=depth)
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_loads_press_light_bodies_by_less_than_certificates_allow(stepper):
+    """Pins on their side sink by at most 0.3 mm under up to 400 times their weight, the end of a heavy plate."""
+    pin = trimesh.creation.cylinder(radius=0.003, height=0.02, sections=24)
+    pin.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    ratios = np.array([1, 50, 100, 200, 400])
+    body = body_of(pin)
+    poses = [pose_at((0.05 * i, 0, 0.003)) for i in range(len(ratios))]
+    world = world_of(stepper, [body] * len(ratios), [table()], poses)
+    forces = np.zeros((len(ratios), 2, 3))
+    forces[:, 0, 2] = -(ratios - 1) * body.mass.mass * GRAVITY
+    world.set_forces(forces)
+    run_until(world, 0.5)
+    sunk = [-lowest(pin, pose) for pose in world.poses]
+    run_until(world, 1.0)
+    assert max(sunk) < 3e-4
+    np.testing.assert_allclose([-lowest(pin, pose) for pose in world.poses], sunk, atol=5e-6)
 
 
 @pytest.mark.parametrize("stepper", ["mujoco", pytest.param("warp", marks=pytest.mark.extended)])

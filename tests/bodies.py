@@ -38,14 +38,14 @@ def body_of(*pieces, density=3000.0, **material):
     return Body(pieces, mass, ContactMaterial(**material))
 
 
-def table(pose=None, **material):
-    """Return a box whose top is the plane z = 0 of its pose."""
+def table(pose=None, size=1.0, **material):
+    """Return a box with a square top [m] in the plane z = 0 of its pose."""
     from mitsplat.physics.friction import ContactMaterial
     from mitsplat.physics.worlds import Collider
 
     top_from_box = trimesh.transformations.translation_matrix((0, 0, -0.05))
     return Collider(
-        ContactMaterial(**material), box=((1.0, 1.0, 0.1), (np.eye(4) if pose is None else pose) @ top_from_box)
+        ContactMaterial(**material), box=((size, size, 0.1), (np.eye(4) if pose is None else pose) @ top_from_box)
     )
 
 

@@ -149,6 +149,9 @@ def has_rested(
         def _set_rolling_friction(self, enabled: bool) -> None:
             pass
 
+        def _set_restitution(self, enabled: bool) -> None:
+            pass
+
         def _coordinates(self) -> Float64Array:
             return self._frame
 

@@ -26,7 +26,10 @@ _QUIET_MOTION, _QUIET_TIME = 1e-4, 0.25
 WALL_DISTANCE = 1e-3
 """Distance from a wall below which a body leans against it [m]."""
 FREE_TIME = 1.5
-"""Time without rolling friction for bodies that fall in random poses [s], longer than rebounds last."""
+"""Time with rebounds, and without rolling friction for bodies that fall in random poses [s].
+
+Rebounds last longer from a restitution of about 0.75 on.
+"""
 _SPEED_WINDOW = 0.05  # averaging time of the reported speeds [s]
 _DRAG_TIME = 0.2  # time constant of the drag on bodies that still move after FREE_TIME [s]
 # Bodies are late if they roll or rock while the others rest: they move by more than a limit [m] within a time [s]. At
@@ -89,11 +92,11 @@ def run_to_rest(
     quarter, rolling friction is disabled, because it would let a box balance on its edge. It is also disabled in the
     first seconds of bodies that tumble, because discs would stop on their rim.
 
-    Bodies that still move after 1.5 s are slowed by a drag with a time constant of 0.2 s, which ends together with
-    rolling friction. A body fails if it leaves the bounds or leans against a wall. It also fails if it still moves
-    after half of the bodies, or all but one, have moved by less than 1 mm for a second. With ``redraw``, failed bodies
-    start again from new poses, up to eight times, while the others stay where they are. Otherwise, the drop is
-    rejected.
+    Bodies that still move after 1.5 s no longer rebound, and are slowed by a drag with a time constant of 0.2 s, which
+    ends together with rolling friction. A body fails if it leaves the bounds or leans against a wall. It also fails if
+    it still moves after half of the bodies, or all but one, have moved by less than 1 mm for a second. With ``redraw``,
+    failed bodies start again from new poses, up to eight times, while the others stay where they are. Otherwise, the
+    drop is rejected.
 
     Args:
         world: Simulation; changed in place.
@@ -142,6 +145,7 @@ def _run_to_rest(
     while world.time - since < _REST_TIME:
         quiet = world.time - since >= _QUIET_TIME
         world.set_rolling_friction(not (world.time - begin < free_time or quiet))
+        world.set_restitution(world.time - begin < FREE_TIME)
         handling.apply(world)
         poses = _advance(world, fastest, drag=world.time - begin >= FREE_TIME and not quiet)
         past.append(poses)

@@ -143,6 +143,7 @@ class World(ABC):
         self.interval = STEPS * timestep
         self.time = 0.0
         self._has_rolling_friction = True
+        self._has_restitution = True
 
     def reset(self, poses: Float64Array, velocities: Float64Array | None = None) -> None:
         """Set the state of all bodies and clear the solver's history.
@@ -153,6 +154,7 @@ class World(ABC):
         """
         self.time = 0.0
         self.set_rolling_friction(True)
+        self.set_restitution(True)
         self._reset(body_coordinates(self.bodies, poses))
         self.set_velocities(np.zeros((len(self.bodies), 2, 3)) if velocities is None else velocities)
         self.set_forces(np.zeros((len(self.bodies), 2, 3)))
@@ -182,6 +184,12 @@ class World(ABC):
         if enabled != self._has_rolling_friction:
             self._has_rolling_friction = enabled
             self._set_rolling_friction(enabled)
+
+    def set_restitution(self, enabled: bool) -> None:
+        """Enable rebounds, or damp all impacts."""
+        if enabled != self._has_restitution:
+            self._has_restitution = enabled
+            self._set_restitution(enabled)
 
     @property
     def poses(self) -> Float64Array:
@@ -215,6 +223,9 @@ class World(ABC):
     def _set_rolling_friction(self, enabled: bool) -> None: ...
 
     @abstractmethod
+    def _set_restitution(self, enabled: bool) -> None: ...
+
+    @abstractmethod
     def _coordinates(self) -> Float64Array:
         """Return position and xyzw quaternion of every body, including those without shape, shape (M, 7)."""
 
@@ -243,6 +254,7 @@ class WarpWorld(World):
             model, nconmax=contacts, njmax=6 * contacts, use_mujoco_contacts=False, **SOLVER_OPTIONS
         )
         self._friction = _array(self._solver.mjw_model.geom_friction)
+        self._restitution = _array(model.shape_material_restitution)
         # Overflow is read from flags, because the kernels would print it at every step.
         self._solver.mjw_model.opt.warn_overflow = 0
         # The pipeline has room for one contact more than the solver, because it stops counting when it is full and sets
@@ -292,6 +304,9 @@ class WarpWorld(World):
     def _set_rolling_friction(self, enabled: bool) -> None:
         assign_array(self._solver.mjw_model.geom_friction, self._friction * (1.0, 1.0, 1.0 if enabled else 0.0))
 
+    def _set_restitution(self, enabled: bool) -> None:
+        assign_array(self._solver.model.shape_material_restitution, self._restitution * enabled)
+
     def _coordinates(self) -> Float64Array:
         return _array(self._states[0].body_q)
 
@@ -310,7 +325,7 @@ class MujocoWorld(World):
         )
         self._model, self._data = solver.mj_model, solver.mj_data
         self._model.opt.timestep, self._model.opt.tolerance = timestep, _TOLERANCE
-        self._restitution = solver.geom_restitution()
+        self._restitution = self._geom_restitution = solver.geom_restitution()
         self._friction = np.array(self._model.geom_friction)
         self._centres = np.array([body.mass.centre for body in bodies])
 
@@ -399,6 +414,9 @@ class MujocoWorld(World):
 
     def _set_rolling_friction(self, enabled: bool) -> None:
         self._model.geom_friction[:] = self._friction * (1.0, 1.0, 1.0 if enabled else 0.0)
+
+    def _set_restitution(self, enabled: bool) -> None:
+        self._restitution = self._geom_restitution * enabled
 
     def _coordinates(self) -> Float64Array:
         return np.array(self._data.qpos).reshape(-1, 7)[:, [0, 1, 2, 4, 5, 6, 3]]

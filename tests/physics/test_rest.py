@@ -157,6 +157,31 @@ def test_the_drag_on_late_bodies_equals_its_closed_form(stepper):
     assert begin - 0.01 < outcome.time < begin + 0.26
 
 
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_bodies_that_lose_no_energy_rebound_for_a_second_and_a_half(stepper):
+    """With a restitution of 1, a box that falls flat returns to its height, and all bodies rest in the end."""
+    from mitsplat.physics.rest import run_to_rest
+
+    rod = trimesh.creation.cylinder(radius=0.003, height=0.03, sections=24)
+    bodies = [body_of(trimesh.creation.box((0.02, 0.02, 0.02)), restitution=1.0)]
+    bodies += [body_of(rod, restitution=1.0)] * 5
+    turns = Rotation.random(5, random_state=np.random.default_rng(0))
+    starts = [pose_at((0, 0, 0.11)), *(pose_at((0.1 * i + 0.1, 0, 0.1), turn) for i, turn in enumerate(turns))]
+    wide = table(restitution=1.0, size=20.0)
+    world = world_of(stepper, bodies, [wide], starts)
+    heights = []
+    outcome = run_to_rest(
+        world,
+        max_time=6.0,
+        bounds=EVERYWHERE,
+        observe=lambda time, poses, again: heights.append((time, poses[0, 2, 3])),
+    )
+    assert outcome.rejection == ""
+    for first, last, share in [(0.2, 0.4, 0.95), (1.3, 1.5, 0.8)]:
+        assert max(height - 0.01 for time, height in heights if first < time < last) > share * 0.1
+    assert outcome.time < 3.0
+
+
 @pytest.mark.parametrize(("leans", "reason"), [(False, "keeps moving"), (True, "rests against the enclosure")])
 def test_a_body_that_fails_starts_again_while_the_others_stay(leans, reason):
     """Four of five blocks rest. The fifth is pushed, or stands 0.5 mm from a wall."""

@@ -153,12 +153,11 @@ def in_srgb(image: Image.Image) -> Image.Image:
             *(image.mode, image.mode),
             renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
         )
-        probe = ImageCms.applyTransform(Image.fromarray(levels).convert(image.mode), transform)
-        is_srgb = np.abs(np.asarray(probe.convert("RGB")).astype(int) - levels).max() <= _EQUAL_COLOURS
-        converted = None if is_srgb else ImageCms.applyTransform(image, transform)
+        probe = transform.apply(Image.fromarray(levels).convert(image.mode))
+        if np.abs(np.asarray(probe.convert("RGB")).astype(int) - levels).max() <= _EQUAL_COLOURS:
+            return image
+        converted = transform.apply(image)
     except (ImageCms.PyCMSError, OSError):
-        return image
-    if converted is None:
         return image
     converted.info = {**image.info, **converted.info}  # with EXIF
     return converted

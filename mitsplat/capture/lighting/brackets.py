@@ -21,7 +21,7 @@ from scipy.sparse.linalg import spsolve
 
 from mitsplat.arrays import BoolArray, ByteImage, Float32Array, Float64Array
 from mitsplat.errors import InputError
-from mitsplat.images.colour import decode_srgb, eight_bit
+from mitsplat.images.colour import decode_srgb, eight_bit, in_srgb
 from mitsplat.storage.files import IMAGE_ERRORS
 
 CLIPPED = 250
@@ -67,7 +67,7 @@ def read_photograph(path: Path) -> Photograph:
             image.load()
             exif = image.getexif()
             known = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-            pixels = np.asarray(eight_bit(ImageOps.exif_transpose(image)))
+            pixels = np.asarray(eight_bit(in_srgb(ImageOps.exif_transpose(image))))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IMAGE_ERRORS as error:

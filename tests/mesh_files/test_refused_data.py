@@ -10,7 +10,7 @@ from PIL import Image
 
 from mitsplat.bake.mesh_parts import read_model
 from mitsplat.errors import InputError
-from tests.mesh_files.test_spellings import COLOUR, FACES, FLOATS, POINTS, RED, dae, obj, ply, shown
+from tests.mesh_files.test_spellings import COLOUR, FACES, FLOATS, POINTS, RED, dae, is_complete, obj, ply, shown, stl
 from tests.mesh_files.test_threemf import tetrahedron, write
 
 NAMES = ("red", "green", "blue")
@@ -65,6 +65,11 @@ def test_a_text_stl_whose_last_solid_is_cut_is_refused(tmp_path: Path, cut: int)
         read_model(tmp_path / "a.stl")
     (tmp_path / "b.stl").write_text((text_stl("a", 0) + text_stl("facet", 5)).upper())
     assert len(read_model(tmp_path / "b.stl").parts) == 2
+
+
+def test_a_binary_stl_with_facets_in_its_header_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.stl").write_bytes(stl(header=b"4 facets of a tetrahedron"))
+    assert is_complete(read_model(tmp_path / "a.stl"))
 
 
 @pytest.mark.parametrize("more", [" 1 0.5 0 1", " 1 1 0.5 0", " 255 128 0 255", " 1 0.5"])

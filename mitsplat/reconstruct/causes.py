@@ -56,7 +56,7 @@ def find_causes(capture: Capture, pictures: Pictures) -> dict[str, str]:
             "or import a mesh",
             *("psnr", "mesh_iou", "offset", "surface", "watertight"),
         )
-    elif capture.table and (share := share_on_support(own)) > _MAX_SUPPORT_SHARE:
+    elif capture.table and len(own) and (share := share_on_support(own)) > _MAX_SUPPORT_SHARE:
         add_cause(
             f"{share:.0%} of the points inside the masks lie in the support surface, so masks seem to include it: "
             "photograph the object on another surface, or pick it",

@@ -113,3 +113,8 @@ def test_an_object_without_texture_is_reported():
     found = find_causes(*dotted(np.concatenate([body, cloth]), np.arange(230) < 30))
     assert set(found) == {"psnr", "mesh_iou", "offset", "surface", "watertight"}
     assert found["psnr"].startswith("photos share only 30 points on the object")
+
+
+def test_a_capture_on_a_table_without_points_has_no_causes():
+    """Poses of another program may come without points."""
+    assert find_causes(*dotted(np.zeros((0, 3)), np.zeros(0, dtype=bool))) == {}

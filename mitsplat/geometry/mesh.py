@@ -145,10 +145,16 @@ def contact_points(mesh: trimesh.Trimesh) -> Float64Array:
     return np.concatenate([mesh.vertices, between])
 
 
+def solid_manifold(solid: trimesh.Trimesh) -> manifold3d.Manifold:
+    """Return a closed surface as a solid of Manifold, in single precision."""
+    # Manifold refuses subclasses of NumPy arrays whose rows are not contiguous. Reordered faces are such arrays.
+    vertices = np.ascontiguousarray(solid.vertices, np.float32)
+    return manifold3d.Manifold(manifold3d.Mesh(vertices, np.ascontiguousarray(solid.faces, np.uint32)))
+
+
 def simplify_solid(solid: trimesh.Trimesh, tolerance: float) -> trimesh.Trimesh:
     """Return a closed surface with fewer faces, within about ``tolerance`` [m] of the original (by Manifold)."""
-    vertices, faces = solid.vertices.astype(np.float32), solid.faces.astype(np.uint32)
-    mesh = manifold3d.Manifold(manifold3d.Mesh(vertices, faces)).simplify(tolerance).to_mesh()
+    mesh = solid_manifold(solid).simplify(tolerance).to_mesh()
     simple = trimesh.Trimesh(mesh.vert_properties[:, :3].astype(np.float64), mesh.tri_verts, process=False)
     return simple if simple.is_volume else solid
 

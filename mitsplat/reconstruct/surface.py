@@ -16,7 +16,6 @@ from typing import Any
 
 import cv2
 import drjit as dr
-import manifold3d
 import mitsuba as mi
 import numpy as np
 import trimesh
@@ -28,7 +27,7 @@ from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.mesh import join_meshes
+from mitsplat.geometry.mesh import join_meshes, solid_manifold
 from mitsplat.progress import Progress
 from mitsplat.renderer.layers import make_sensor, render_splats
 from mitsplat.renderer.rays.sensors import view_of
@@ -176,8 +175,7 @@ def simplify_surface(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     if not surface.is_watertight:
         return simple
     if not simple.is_volume:
-        vertices, triangles = surface.vertices.astype(np.float32), surface.faces.astype(np.uint32)
-        solid = manifold3d.Manifold(manifold3d.Mesh(vertices, triangles))
+        solid = solid_manifold(surface)
         tolerance = 1e-4 * surface.scale
         while solid.num_tri() > faces and tolerance < 0.1 * surface.scale:
             solid = solid.simplify(tolerance)

@@ -92,6 +92,15 @@ def scanned_angle() -> trimesh.Trimesh:
     return trimesh.Trimesh(solid.vertices + noise, solid.faces, process=False)
 
 
+def test_faces_with_columns_in_another_order_in_memory_are_simplified():
+    ball = trimesh.creation.icosphere(3)
+    reordered = trimesh.Trimesh(ball.vertices, ball.faces[:, [0, 1, 2]], process=False)
+    assert not reordered.faces.flags.c_contiguous
+    thin, expected = (simplify_solid(solid, 1e-2) for solid in (reordered, ball))
+    assert len(thin.faces) < len(ball.faces)
+    assert np.array_equal(thin.triangles, expected.triangles)
+
+
 def test_a_scan_is_simplified_before_it_is_split():
     scan = scanned_angle()
     assert scan.is_volume

@@ -65,7 +65,7 @@ def test_another_layout_compiles_no_new_kernels() -> None:
         first = strewn(0, [0, 1, 2, 3, 3])
         # The first view of a layout builds data shared by its other views.
         compiled(renderer, 0, first)
-        compiled(renderer, 1, first)
+        usual, _ = compiled(renderer, 1, first)
         for index, layout in (
             (2, first),
             (12, strewn(1, [4, 5, 6, 7, 8])),
@@ -74,7 +74,9 @@ def test_another_layout_compiles_no_new_kernels() -> None:
         ):
             run, new = compiled(renderer, index, layout)
             assert run > 50
-            assert new == 0, f"frame {index}: {new} of {run} kernels"
+            # Dr.Jit evaluates scheduled arrays of equal size in one kernel: where two sizes happen to be equal, one new
+            # kernel replaces two.
+            assert new <= max(usual - run, 0), f"frame {index}: {new} of {run} kernels"
 
 
 @pytest.mark.extended

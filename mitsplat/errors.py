@@ -144,7 +144,7 @@ def check_fields(settings: object) -> None:
 def _has_kind(value: object, kind: Any) -> bool:
     """Return True if a value has the type of an annotation; the items of lists and mappings are not checked."""
     if get_origin(kind) is Literal:
-        return value in get_args(kind)
+        return any(isinstance(value, type(one)) and value == one for one in get_args(kind))
     if kind in (int, float):
         return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
     if get_origin(kind) is tuple:
@@ -172,18 +172,23 @@ def _describe_kind(kind: Any) -> list[str]:
 def checks_arguments(kind: type[_Class]) -> type[_Class]:
     """Class decorator: check the arguments of all public methods by their annotations.
 
-    Numbers, text, paths, lists, mappings, arrays and objects are checked. An argument that becomes an array must
-    consist of numbers. ``from_json`` also names missing keys.
+    Numbers, text, paths, lists, dictionaries, arrays and objects are checked, and alternatives of them, such as
+    ``int | None``. An argument that becomes an array (``ArrayLike``) must consist of numbers. Not checked are values of
+    protocols, ``Mapping`` and ``Any``, and alternatives that include one of these or ``ArrayLike``. ``from_json`` also
+    names missing keys.
     """
     for name, member in list(vars(kind).items()):
         function = getattr(member, "__func__", member)
         if not name.startswith("_") and isinstance(function, types.FunctionType):
-            checked = _checked(function, f"{kind.__name__}.{name}")
+            if name == "from_json":
+                function = _with_missing_keys(function, f"{kind.__name__}.{name}")
+            checked = _checked(function)
             setattr(kind, name, type(member)(checked) if isinstance(member, classmethod | staticmethod) else checked)
     return kind
 
 
-def _checked(function: Callable[..., Any], place: str) -> Callable[..., Any]:
+def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a method that checks its arguments."""
     signature = inspect.signature(function)
     hints = functools.cache(lambda: get_type_hints(function))  # classes of later modules are known at the first call
 
@@ -196,8 +201,16 @@ def _checked(function: Callable[..., Any], place: str) -> Callable[..., Any]:
         for name, value in given.items():
             if name in hints():
                 _check_argument(value, hints()[name], name)
-        if not place.endswith(".from_json"):
-            return function(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return call
+
+
+def _with_missing_keys(function: Callable[..., Any], place: str) -> Callable[..., Any]:
+    """Return a method ``from_json`` that refuses values that ``to_json`` has not made in one sentence."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
         try:
             return function(*args, **kwargs)
         except KeyError as error:
@@ -231,15 +244,15 @@ def _check_argument(value: Any, hint: Any, place: str) -> None:
             words = [word for word in words if word != "text"]
         raise InputError(f"{place} must be {list_in_words(words, 'or')} (got {describe(value)})")
     for kind in kinds:
-        item = get_args(kind)
-        if get_origin(kind) is Sequence and isinstance(value, list | tuple) and isinstance(item[0], type):
-            check_list(value, item[0], place)
+        if get_origin(kind) is Sequence and isinstance(value, list | tuple):
+            for number, one in enumerate(value):
+                _check_argument(one, get_args(kind)[0], f"{place}[{number}]")
 
 
 def _is_checked(kind: Any) -> bool:
     """Return True for an annotation whose values are checked; values of protocols are converted by the method."""
     base = get_origin(kind) or kind
-    if base in (object, Mapping):  # methods describe the mappings that they need
+    if base in (object, Any, Mapping):  # methods describe the mappings that they need
         return False
     return base is Literal or (isinstance(base, type) and not getattr(base, "_is_protocol", False))
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from typing import Any, get_type_hints
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, get_type_hints
 
 import numpy as np
 import pytest
@@ -110,3 +110,22 @@ def test_python_names_arguments_that_are_missing() -> None:
         Part().turned(1, axis=5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="own sentence"):
         Part().from_json()
+
+
+def test_annotations_of_all_forms_are_checked_by_their_meaning() -> None:
+    @checks_arguments
+    class Part:
+        def named(self, name: Any, side: Literal["left", "right"] = "left") -> object:
+            return name
+
+        def moved(self, steps: Sequence[float], limit: int | None = None) -> int:
+            return len(steps)
+
+    part = Part()
+    assert part.named(5) == 5 and part.moved([1, np.float32(2)]) == 2 and part.moved((), 3) == 0
+    with pytest.raises(InputError, match=r"steps\[1\] must be a number \(got str 'a'\)"):
+        part.moved([1, "a"])  # type: ignore[list-item]
+    with pytest.raises(InputError, match=r"limit must be a whole number or None \(got float 1\.5\)"):
+        part.moved([], 1.5)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="side must be left or right"):
+        part.named(5, np.zeros(2))  # type: ignore[arg-type]

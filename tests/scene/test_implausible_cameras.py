@@ -144,6 +144,8 @@ MILLIMETRES = np.array([1, 1, 1, 1000])
             "in millimetres, and in the axes",
         ),
         (look_at_pose((300, -400, 700), (300, 0, 0)), "is its position in millimetres?"),
+        (look_at_pose((0.1, 0.2, -0.9), (0.1, 0.6, -1.8)), "the camera is below the objects, at z = -0.9 m: does z of"),
+        (look_at_pose((0.9, 0, -0.05), (0, 0, 0)) @ FLIP, "is its matrix in the axes of OpenGL"),  # a low camera
     ],
 )
 def test_a_pose_that_sees_nothing_is_refused_with_the_likely_cause(

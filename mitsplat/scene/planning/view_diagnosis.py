@@ -13,6 +13,8 @@ from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 
 FAR = 10.0
 """Distance of a camera from all objects above which its position is probably in millimetres [m]."""
+STEEP = 0.5
+"""Sine of the angle from below at which what supports the objects hides them from a camera."""
 
 
 def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
@@ -44,19 +46,27 @@ def distance_to_box(point: Float64Array, low: Float64Array, high: Float64Array) 
 def pose_cause(camera: Camera, low: Float64Array, high: Float64Array) -> str:
     """Return the likely cause of a camera that does not see a box, as a question; empty if there is none.
 
-    A cause is likely if the camera without it sees the box from outside. Of several causes, the one is taken with which
-    the camera looks most directly at the middle of the box.
+    A cause is likely if the camera without it sees the box from outside, and not steeply from below. Of several causes,
+    the one is taken with which the camera looks most directly at the middle of the box.
     """
     best, found = np.inf, ""
     far = distance_to_box(camera.centre, low, high) > FAR
     for cause, pose in _candidates(camera.world_from_camera, far=far):
         candidate = replace(camera, world_from_camera=pose)
         if distance_to_box(candidate.centre, low, high) > 0 and sees(candidate, low, high):
-            ahead = (low + high) / 2 - candidate.centre
-            off = float(np.arccos(np.clip(ahead @ pose[:3, 2] / np.linalg.norm(ahead), -1, 1)))
-            if off < best - 1e-6:
+            ahead = _direction(candidate, low, high)
+            off = float(np.arccos(np.clip(ahead @ pose[:3, 2], -1, 1)))
+            if ahead[2] < STEEP and off < best - 1e-6:
                 best, found = off, cause
+    if not found and not far and _direction(camera, low, high)[2] > STEEP:
+        return f"the camera is below the objects, at z = {camera.centre[2]:.3g} m: does z of its world point up?"
     return found or ("is its position in millimetres?" if far else "")
+
+
+def _direction(camera: Camera, low: Float64Array, high: Float64Array) -> Float64Array:
+    """Return the unit vector from a camera to the middle of a box; zeros if the camera is there."""
+    ahead = (low + high) / 2 - camera.centre
+    return np.asarray(ahead / max(float(np.linalg.norm(ahead)), 1e-12), np.float64)
 
 
 def _candidates(pose: Float64Array, *, far: bool) -> Iterator[tuple[str, Float64Array]]:

@@ -52,12 +52,13 @@ def describe_time(layouts: int, settle: float | None, images: int, image: float)
     ``settle`` is None if no layout was timed, because the first one was in the cache.
     """
     total = format_time(layouts * (settle or 0.0) + images * image)
-    text = f"about {total} in one process: {images} images of {image:.2g} s"
+    text = f"about {total} in one process: {images} image{'s' * (images != 1)} of {image:.2g} s"
+    drops = f"{layouts} layout{'s' * (layouts != 1)}"
     if not layouts:
         return f"{text}; no layout to settle"
     if settle is None:
-        return f"{text}, without settling {layouts} layouts"
-    return f"{text}, and {layouts} layouts that settle in {settle:.2g} s"
+        return f"{text}, without settling {drops}"
+    return f"{text}, and {drops} that settle{'s' * (layouts == 1)} in {settle:.2g} s"
 
 
 def format_time(seconds: float) -> str:

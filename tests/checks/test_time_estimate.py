@@ -37,6 +37,8 @@ def test_the_time_is_that_of_all_layouts_and_images() -> None:
     )
     assert time_estimate.describe_time(0, 8.0, 20, 1.4).startswith("about 28 s in one process: 20 images")
     assert time_estimate.describe_time(3, None, 20, 1.4).endswith("20 images of 1.4 s, without settling 3 layouts")
+    assert time_estimate.describe_time(1, None, 2, 1.4).endswith("2 images of 1.4 s, without settling 1 layout")
+    assert time_estimate.describe_time(1, 8.0, 1, 1.4).endswith("1 image of 1.4 s, and 1 layout that settles in 8 s")
 
 
 def test_a_check_measures_one_layout_and_the_second_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

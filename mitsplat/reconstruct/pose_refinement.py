@@ -137,21 +137,22 @@ def refine_pose(
         if progress is not None:
             progress(number, len(turned) + 2, "refining the pose of the mesh")
 
-    ranked = []
+    before = _overlaps(validation, silhouettes, np.eye(4))
+    motion, misfit = _solve(training, silhouettes, frame, limits, _ROUNDS)
+    after = _overlaps(validation, silhouettes, motion)
+    kept = is_gain(after - before, 1.0)
+    report_progress(1)
+    misfits = []
     for number, start in enumerate(turned):
-        ranked.append((_solve(few, silhouettes, start, limits, _FEW_ROUNDS)[1], number))
-        report_progress(number + 1)
-    best = after = before = _overlaps(validation, silhouettes, np.eye(4))
-    found, most = np.eye(4), np.inf
-    for start, least in ((frame, 1.0), *((turned[number], _TURN_GAIN) for _, number in sorted(ranked)[:1])):
-        motion, misfit = _solve(training, silhouettes, start, limits, _ROUNDS)
-        overlaps = _overlaps(validation, silhouettes, motion)
-        if kept := misfit < most and is_gain(overlaps - best, least):
-            found, best = motion, overlaps
-        if kept or start is frame:
-            after, most = overlaps, _TURN_MISFIT * misfit
-        report_progress(len(turned) + (1 if start is frame else 2))
-    return RefinedPose(found, best is not before, float(before.mean()), float(after.mean()), len(validation))
+        misfits.append(_solve(few, silhouettes, start, limits, _FEW_ROUNDS)[1])
+        report_progress(2 + number)
+    if turned:
+        turned_motion, turned_misfit = _solve(training, silhouettes, turned[np.argmin(misfits)], limits, _ROUNDS)
+        overlaps = _overlaps(validation, silhouettes, turned_motion)
+        if turned_misfit < _TURN_MISFIT * misfit and is_gain(overlaps - (after if kept else before), _TURN_GAIN):
+            motion, after, kept = turned_motion, overlaps, True
+    report_progress(len(turned) + 2)
+    return RefinedPose(motion if kept else np.eye(4), kept, float(before.mean()), float(after.mean()), len(validation))
 
 
 def _solve(

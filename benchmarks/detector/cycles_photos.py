@@ -10,8 +10,9 @@ mitsplat's. Materials, light, lens (depth of field, motion blur), denoiser and t
 (``blender_photos.py``).
 
 WORK/cycles_inputs gets the scenes; ``blender_photos.py`` reads nothing else, and may run on another machine.
-WORK/cycles becomes a COCO folder, which ``cycles.yaml`` evaluates. Existing scenes and photographs are not made again.
-Without ``--blender``, only scenes and labels are written.
+WORK/cycles becomes a COCO folder, which ``cycles_96.yaml`` evaluates; results of fewer photographs are recorded as
+``cycles.yaml``. Existing scenes and photographs are not made again. Without ``--blender``, only scenes and labels are
+written.
 
 Masks are the object index at pixel centres, without depth of field and motion blur. A part is labelled if it shows at
 least ``LEAST_SEEN`` of the pixels that it covers alone. The whole set is for testing only.

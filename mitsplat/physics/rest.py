@@ -28,7 +28,7 @@ WALL_DISTANCE = 1e-3
 FREE_TIME = 1.5
 """Time with rebounds, and without rolling friction for bodies that fall in random poses [s].
 
-Rebounds last longer from a restitution of about 0.75 on.
+Without this limit, rebounds would last longer from a restitution of about 0.75 on.
 """
 _SPEED_WINDOW = 0.05  # averaging time of the reported speeds [s]
 _DRAG_TIME = 0.2  # time constant of the drag on bodies that still move after FREE_TIME [s]

@@ -295,8 +295,8 @@ class LightFilter:
         """Return averages, and the effective number of equally weighted pixels with the same number of rays.
 
         If ``share`` (light share and variance) is given, only neighbours whose share differs by no more than noise
-        count. If ``lobe`` (mirrored direction, smallest cosine between two of them, gloss) is given, only
-        neighbours of the same gloss that mirror similar directions count.
+        count. If ``lobe`` (mirrored direction, smallest cosine between two of them, gloss) is given, only neighbours of
+        the same gloss that mirror similar directions count.
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)

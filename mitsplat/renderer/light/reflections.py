@@ -30,7 +30,6 @@ of 8 x 8 pixels, and of eight rays of eight such pixels is at least 0.43 of the 
 steps, these have little noise and bias on a metal ball under uniform light.
 """
 
-
 FEW_PIXELS = 30.0
 """Effective number of averaged pixels below which the average is widened as far as noise explains differences."""
 

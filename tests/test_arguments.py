@@ -39,6 +39,10 @@ STORED = CAMERA.to_json()
         (lambda: Camera.from_json(None), r"stored must be a dict \(got NoneType None\)"),
         (lambda: Camera.from_json({**STORED, "intrinsics": None}), r"intrinsics must have shape \(3, 3\)"),
         (lambda: Camera.from_json({**STORED, "intrinsics": [[1, 0], [0, 1]]}), r"intrinsics must have shape \(3, 3\)"),
+        (
+            lambda: Camera.from_json({**STORED, "intrinsics": [[90, 0, 32], [0, 90]]}),
+            r"intrinsics must have shape \(3, 3\)",
+        ),
         (lambda: Camera.from_json({**STORED, "intrinsics": [[90, 2, 32], [0, 90, 24], [0, 0, 1]]}), "with a skew"),
         (lambda: Camera.from_json({**STORED, "intrinsics": [[90, 0, 0], [0, 90, 0], [32, 24, 1]]}), "have the form"),
         (lambda: Camera.from_json({**STORED, "distortion": None}), "needs the values of to_json"),

@@ -197,7 +197,7 @@ class Camera:
         Raises:
             ValueError: If the values are invalid.
         """
-        if np.shape(stored["intrinsics"]) != (3, 3):
+        if np.array(stored["intrinsics"], dtype=object).shape != (3, 3):  # rows may have unequal lengths
             raise InputError(f"intrinsics must have shape (3, 3) (got {describe(stored['intrinsics'])})")
         ((fx, skew, cx), (lower, fy, cy), last) = stored["intrinsics"]
         if (skew, lower, *last) != (0, 0, 0, 0, 1):

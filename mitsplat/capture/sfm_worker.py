@@ -189,13 +189,11 @@ def match(job: dict[str, Any], database: Path, folder: Path) -> None:
     verification.ransac.max_num_trials = MAX_TRIALS
     names = [name for group in job["groups"] for name in group]
     in_order = sorted(names, key=numbers_in)
-    if (
-        job["matching"] == "sequential"
-        and in_order != sorted(names)
-        and not any(set(" \t") & set(name) for name in names)
-    ):
+    # COLMAP sorts names by their letters. It splits the lines of a list at blanks, so that names must not contain any.
+    needs_list = in_order != sorted(names) and not any(set(" \t") & set(name) for name in names)
+    if job["matching"] == "sequential" and needs_list:
         listed = pycolmap.ImportedPairingOptions()
-        listed.match_list_path = folder / "pairs.txt"  # whose names are separated by blanks
+        listed.match_list_path = folder / "pairs.txt"
         listed.match_list_path.write_text("".join(f"{one} {other}\n" for one, other in sequential_pairs(in_order)))
         pycolmap.match_image_pairs(database, matching, listed, verification, device=pycolmap.Device.cpu)
     elif job["matching"] == "sequential":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import re
 import tempfile
@@ -220,6 +221,9 @@ def _render(path: Path, scene: mi.Scene) -> mi.TensorXf:
 
 
 _PLACE = re.compile(r"(?:[Ww]hile loading|At) (?P<file>.+?) \(line (?P<line>\d+), col \d+\):\s*")
+_ABSENT = re.compile(
+    r'instantiate (?P<kind>[\w ]+) plugin of type "(?P<type>[^"]*)".*Plugin "(?P=type)" not found', re.S
+)
 _UNKNOWN = re.compile(r'unreferenced propert\w+ in (?P<kind>\w+) plugin of type "(?P<type>[^"]+)"')
 _PROPERTY = re.compile(r'- \S+ "(?P<name>[^"]+)"')
 
@@ -242,6 +246,10 @@ def describe_error(path: Path, message: str, original_paths: Mapping[Path, Path]
         documented = _documented_properties(unknown["type"])
         known = f"; it takes {', '.join(documented)}" if documented else ""
         return f"{place}: {unknown['kind']} {unknown['type']!r} takes no {names}{known}"
+    if absent := _ABSENT.search(message):
+        close = difflib.get_close_matches(absent["type"], _plugin_names(), n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        return f"{place}: no {absent['kind']} plugin is called {absent['type']!r}{hint}"
     lines = [line.strip() for line in message.splitlines() if line.strip()]
     last = lines[-1] if lines else "Mitsuba reported an error without a message"
     last = last.removeprefix(f"{InputError.__name__}: ")
@@ -249,6 +257,12 @@ def describe_error(path: Path, message: str, original_paths: Mapping[Path, Path]
     last = _PLACE.sub("", last.removeprefix("Error "))
     last = re.sub(r"\[\w+\] (Error while \w+ing )?", "", last)
     return last if last.startswith(place) else f"{place}: {last}"
+
+
+def _plugin_names() -> list[str]:
+    """Return the names of the plugins of mitsplat, and of those of Mitsuba in C++."""
+    compiled = sorted(file.stem for file in (Path(mi.__file__).parent / "plugins").glob("*.so"))
+    return ["splats", "splat_proxy", "opencv_camera", *compiled]
 
 
 def _documented_properties(plugin: str) -> list[str]:

@@ -127,7 +127,8 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
             try:
                 check_size(mesh, f"shapes[{number}]")
             except InputError as error:
-                yield _fault("shape", str(error), "correct the mesh, or set collider: false")
+                wrong = "the mesh" if shape.mesh else "its size, in metres"
+                yield _fault("shape", str(error), f"correct {wrong}, or set collider: false")
                 return
     for number, (region, arrangements) in enumerate(scene.spec.all_regions):
         where = f"regions[{number - 1}]" if number else "region"

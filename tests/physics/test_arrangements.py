@@ -345,3 +345,9 @@ def test_a_region_without_a_collider_below_is_a_fault(shelf, write_scene):
     shelf["regions"][1] |= {"min": [0.9, 0.9, 0.02], "max": [1.1, 1.1, 0.2]}
     found = [fault.text for fault in layout_faults(load_scene(write_scene(shelf)))]
     assert found == ["regions[1]: no collider is below it, so all objects fall forever"]
+
+
+def test_a_bin_in_millimetres_is_refused_with_the_unit_of_its_size(scene_data, write_scene):
+    scene_data["shapes"] = [{"name": "bin", "bin": {"size": [260, 200, 60], "thickness": 4}}]
+    (fault,) = layout_faults(load_scene(write_scene(scene_data)))
+    assert "got 268 m" in fault.text and fault.remedy == "correct its size, in metres, or set collider: false"

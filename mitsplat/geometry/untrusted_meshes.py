@@ -37,6 +37,12 @@ _PLAIN_PLY = re.compile(
 _WIDTHS = {b"float": 4, b"float32": 4, b"double": 8, b"float64": 8, b"uchar": 1, b"uint8": 1}
 
 
+def refuse_archive(path: Path) -> None:
+    """Raise :class:`InputError` if the name of a mesh file is that of an archive."""
+    if path.suffix.lower() in ARCHIVES:
+        raise InputError(f"{path}: must be a mesh file, not an archive: unpack it")
+
+
 def check_mesh(path: Path, *, read: TrialReader | None = None) -> None:
     """Refuse a mesh file whose reader crashes or takes more memory or time than its size justifies.
 
@@ -50,8 +56,7 @@ def check_mesh(path: Path, *, read: TrialReader | None = None) -> None:
     Raises:
         InputError: If the trial read fails, or for an archive, or if the file is missing or too large.
     """
-    if path.suffix.lower() in ARCHIVES:
-        raise InputError(f"{path}: must be a mesh file, not an archive: unpack it")
+    refuse_archive(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.errors import InputError, MissingResourceError
-from mitsplat.geometry.untrusted_meshes import check_mesh, try_read
+from mitsplat.geometry.untrusted_meshes import check_mesh, refuse_archive, try_read
 from mitsplat.mesh_files.gltf import read_gltf
 from mitsplat.mesh_files.mesh_file import MeshFile
 from mitsplat.mesh_files.step import STEP_SUFFIXES, read_step
@@ -53,6 +53,7 @@ def read_mesh_file(path: Path, *, textures: bool = True) -> MeshFile:
         InputError: If the file cannot be read, requires what is not supported, or lacks a texture.
         MissingResourceError: If the package that reads such files is not installed.
     """
+    refuse_archive(path)
     refuse_other_kinds(path, "a mesh (.glb, .step, .obj, .stl, .ply)", *SUFFIXES)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh file")

@@ -194,6 +194,7 @@ def test_code_that_decides_layouts_is_hashed():
         "storage.cache.write_cache_file",
         "scene.layout.NO_PHYSICS",
         "runtime.warp_start.quiet_warp",
+        "progress.discard_note",
     }
     given |= {"storage.content_hash.ContentHash"}  # names the cached files
     given |= {"storage.files.SPLITS"}  # names of counts; scene.contents assigns layouts to splits

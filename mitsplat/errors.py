@@ -294,10 +294,19 @@ def exit_status(error: BaseException) -> int | None:
     return 2 if isinstance(error, InputError | OSError) else None
 
 
+def failed_path(error: OSError) -> str | None:
+    """Return the path that a system error is about; on a full disk that of the written file, which a copy names second.
+
+    None if the error names no path.
+    """
+    path: str | None = (error.filename2 if error.errno in FULL else None) or error.filename
+    return path
+
+
 def sentence_of(error: BaseException) -> str:
     """Return the user message of an error."""
     if isinstance(error, OSError) and error.strerror:
-        place = (error.filename2 if error.errno in FULL else None) or error.filename  # a copy names its source first
+        place = failed_path(error)
         return f"{place}: {error.strerror}" if place else error.strerror
     if is_out_of_memory(error):
         detail = str(error).partition("\n")[0]

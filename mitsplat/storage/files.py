@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 from PIL import Image
 
-from mitsplat.errors import FULL, InputError, MissingResourceError
+from mitsplat.errors import FULL, InputError, MissingResourceError, failed_path
 from mitsplat.storage.content_hash import file_hash
 
 JsonObject = dict[str, Any]
@@ -305,9 +305,8 @@ def storage_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        place = error.filename or folder
+        place = failed_path(error) or folder
         if error.errno in FULL:
-            place = error.filename2 or place  # a copy names its source first
             raise MissingResourceError(
                 f"{place}: {error.strerror}: free disk space and run again; finished files are kept"
             ) from error

@@ -140,21 +140,33 @@ def eight_bit(image: Image.Image) -> Image.Image:
 def in_srgb(image: Image.Image) -> Image.Image:
     """Return an image with the colours of its ICC profile as sRGB; the same image if it has none or that of sRGB.
 
-    Cameras store photographs in wider colour spaces, such as Display P3 or Adobe RGB. Damaged profiles are ignored.
+    Cameras store photographs in wider colour spaces, such as Display P3 or Adobe RGB. Images of printing colours
+    (CMYK) and grey images become RGB. Damaged profiles are ignored, except for CMYK.
+
+    Raises:
+        ValueError: If an image of CMYK has no profile that can be read. Its colours are unknown then.
     """
     profile = image.info.get("icc_profile")
-    if not profile or image.mode not in ("RGB", "RGBA"):
-        return image
-    levels = np.mgrid[0:256:51, 0:256:51, 0:256:51].reshape(3, 1, -1).T.astype(np.uint8)
+    converted = _from_profile(image, profile) if profile and image.mode in ("RGB", "RGBA", "L", "CMYK") else image
+    if converted.mode == "CMYK":
+        raise ValueError("its colours are CMYK without a readable profile: export it as RGB")
+    return converted
+
+
+def _from_profile(image: Image.Image, profile: bytes) -> Image.Image:
+    """Return an image in sRGB; the same image if the profile is that of sRGB, or damaged."""
+    bands = np.mgrid[(slice(0, 256, 51),) * min(3, len(image.getbands()))]
+    levels = bands.reshape(len(bands), 1, -1).T.astype(np.uint8)
+    probe = Image.fromarray(levels if len(bands) > 1 else levels[..., 0]).convert(image.mode)
     try:
         transform = ImageCms.buildTransform(
             ImageCms.ImageCmsProfile(io.BytesIO(profile)),
             ImageCms.createProfile("sRGB"),
-            *(image.mode, image.mode),
+            *(image.mode, "RGBA" if image.mode == "RGBA" else "RGB"),
             renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
         )
-        probe = transform.apply(Image.fromarray(levels).convert(image.mode))
-        if np.abs(np.asarray(probe.convert("RGB")).astype(int) - levels).max() <= _EQUAL_COLOURS:
+        shown = np.asarray(transform.apply(probe).convert("RGB")).astype(int)
+        if image.mode != "CMYK" and np.abs(shown - levels).max() <= _EQUAL_COLOURS:
             return image
         converted = transform.apply(image)
     except (ImageCms.PyCMSError, OSError):

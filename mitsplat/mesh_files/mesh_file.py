@@ -12,7 +12,7 @@ from PIL import Image
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.errors import InputError
-from mitsplat.images.colour import eight_bit
+from mitsplat.images.colour import eight_bit, in_srgb
 from mitsplat.storage.files import IMAGE_ERRORS
 
 Wrap = Literal["repeat", "mirror", "clamp"]
@@ -149,7 +149,7 @@ def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:
         InputError: If the image is damaged.
     """
     try:
-        return np.array(eight_bit(image))
+        return np.array(eight_bit(in_srgb(image) if image.mode == "CMYK" else image))
     except IMAGE_ERRORS as error:
         raise InputError(f"its texture cannot be read ({error})") from error
 

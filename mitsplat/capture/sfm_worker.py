@@ -142,6 +142,10 @@ def assign_ids(job: dict[str, Any], images: Path, database: Path) -> None:
         found = [image.name for image in sorted(opened.read_all_images(), key=lambda image: image.image_id)]
     if found == wanted:
         return
+    places = places_of(wanted)
+    if found == [places[name] for name in wanted]:  # matching was interrupted
+        rename_images(database, {place: name for name, place in places.items()})
+        return
     database.unlink()  # an interrupted run left only some of the images
     pycolmap.Database.open(database).close()
     for names in job["groups"]:
@@ -173,10 +177,17 @@ def numbers_in(name: str) -> list[str | int]:
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
-def sequential_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the pairs of COLMAP's sequential matching of photos in an order: each with those 1, 2, 4, ... later."""
-    steps = [2**power for power in range(SEQUENTIAL_OVERLAP)]
-    return [(name, names[at + step]) for at, name in enumerate(names) for step in steps if at + step < len(names)]
+def places_of(names: Sequence[str]) -> dict[str, str]:
+    """Return for each name its place in the order of the numbers in the names, as text that sorts in this order."""
+    return {name: f"{place:08d}" for place, name in enumerate(sorted(names, key=numbers_in))}
+
+
+def rename_images(database: Path, names: Mapping[str, str]) -> None:
+    """Rename images of a database to the values of ``names``."""
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            image.name = names[image.name]
+            opened.update_image(image)
 
 
 def match(job: dict[str, Any], database: Path, folder: Path) -> None:
@@ -188,18 +199,13 @@ def match(job: dict[str, Any], database: Path, folder: Path) -> None:
     verification.ransac.random_seed = SEED
     verification.ransac.max_num_trials = MAX_TRIALS
     names = [name for group in job["groups"] for name in group]
-    in_order = sorted(names, key=numbers_in)
-    # COLMAP sorts names by their letters. It splits the lines of a list at blanks, so that names must not contain any.
-    needs_list = in_order != sorted(names) and not any(set(" \t") & set(name) for name in names)
-    if job["matching"] == "sequential" and needs_list:
-        listed = pycolmap.ImportedPairingOptions()
-        listed.match_list_path = folder / "pairs.txt"
-        listed.match_list_path.write_text("".join(f"{one} {other}\n" for one, other in sequential_pairs(in_order)))
-        pycolmap.match_image_pairs(database, matching, listed, verification, device=pycolmap.Device.cpu)
-    elif job["matching"] == "sequential":
+    if job["matching"] == "sequential":
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap = SEQUENTIAL_OVERLAP
+        places = places_of(names)
+        rename_images(database, places)  # COLMAP sorts names by their letters
         pycolmap.match_sequential(database, matching, pairing, verification, device=pycolmap.Device.cpu)
+        rename_images(database, {place: name for name, place in places.items()})
     else:
         blocks = pycolmap.ExhaustivePairingOptions()
         blocks.block_size = BLOCK

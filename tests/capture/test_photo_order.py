@@ -67,4 +67,28 @@ def test_photos_without_leading_zeros_are_matched_in_the_order_of_their_numbers(
     """COLMAP sorts by letters: frame10 comes after frame1, and frame9 is not compared with frame10."""
     expected = pairs_of(tmp_path / "padded", "frame{:03d}.png")
     assert (8, 9) in expected
-    assert pairs_of(tmp_path / "plain", "frame{}.png") == expected
+    for number, name in enumerate(("frame{}.png", "img {}.png")):
+        assert pairs_of(tmp_path / str(number), name) == expected
+
+
+RESUME = """
+import json, sys
+from pathlib import Path
+from mitsplat.capture.sfm_worker import assign_ids, places_of, pycolmap, rename_images
+names, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
+database = folder / "database.db"
+job = {"groups": [names], "camera_model": "PINHOLE"}
+with pycolmap.Database.open(database) as opened:
+    before = {image.name: len(opened.read_keypoints(image.image_id)) for image in opened.read_all_images()}
+rename_images(database, places_of(names))  # as an interrupted matching leaves them
+assign_ids(job, folder / "images", database)
+with pycolmap.Database.open(database) as opened:
+    after = {image.name: len(opened.read_keypoints(image.image_id)) for image in opened.read_all_images()}
+print(json.dumps([list(after) == names, after == before and min(after.values()) > 0]))
+"""
+
+
+def test_features_are_kept_after_an_interrupted_matching(tmp_path: Path) -> None:
+    pairs_of(tmp_path, "img {}.png")
+    names = sorted(f"img {number}.png" for number in range(1, COUNT + 1))
+    assert run(RESUME, json.dumps(names), str(tmp_path)) == [True, True]

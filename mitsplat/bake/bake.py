@@ -23,6 +23,7 @@ from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshModel, MeshPart, bake_li
 from mitsplat.bake.mesh_surface import MeshSurface
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.bake.radiance import BOUNCES, bake_radiance, hemisphere, ray_offset, rotate_directions
+from mitsplat.bake.size_checks import check_size, mass_warnings
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.bake.verification import BakedView, PictureFunction, compare_views, compare_with_textures
 from mitsplat.errors import InputError, check_fields, check_list, check_number, check_text, check_type
@@ -46,12 +47,6 @@ _TRIAL_GAUSSIANS = 1000
 _DETAIL_GAIN = 7.0
 """Additional relative density of Gaussians where the texture changes strongly."""
 _MAX_GAUSSIANS = 2_000_000
-_MIN_OBJECT_SIZE, _MAX_OBJECT_SIZE = 0.001, 5.0
-"""Size range of objects [m]; sizes outside of it indicate wrong units."""
-_MIN_SIZE, _MAX_SIZE = 1e-5, 1e5
-"""Size range of any mesh [m]; 32-bit floats are too coarse outside of it."""
-_FLAT = 1e-6
-"""Thickness relative to the size below which a mesh encloses no volume."""
 _FIT_VIEWS = 12
 _BASE_COLOUR_SAMPLES, _RADIANCE_SAMPLES = (4, 9), (16, 36)
 """Rays per pixel of the pictures for the fit and for the comparison."""
@@ -189,7 +184,7 @@ def bake_asset(
     parts = model.parts
     surface = MeshSurface(parts)
     source = str(mesh) if isinstance(mesh, str | Path) else name
-    _check_mesh(source, surface.mesh, model.units, kind, any_size=any_size, has_pieces=bool(pieces))
+    check_size(source, surface.mesh, model.units, kind, any_size=any_size, has_pieces=bool(pieces))
     stages("placing Gaussians")
     rng = np.random.default_rng(settings.seed)
     surfels = _place_visible_surfels(surface, parts, settings, rng)
@@ -227,6 +222,7 @@ def bake_asset(
         white=None if lights is None else float(np.pi),
     )
     warnings = _mesh_warnings(model, surface if kind == "object" else None, settings.seed)
+    warnings += mass_warnings(asset, model.units)
     units = _describe_units(model)
     if not settings.verify_views:
         stages.end()
@@ -316,43 +312,6 @@ def _describe_units(model: MeshModel) -> str:
         return text
     part = "" if len(model.stated) == 2 else f"{model.stated[0]} "
     return f"{text} ({part}stated by the file)"
-
-
-def _check_mesh(
-    source: str, mesh: trimesh.Trimesh, units: float, kind: str, *, any_size: bool, has_pieces: bool
-) -> None:
-    """Raise InputError if a mesh in metres is too small or too large, or if an object encloses no volume."""
-    size = float(mesh.extents.max())
-    if kind == "object" and not any_size:
-        _check_size(source, size, units)
-    if kind == "object" and not has_pieces and _is_flat(mesh):
-        raise InputError(
-            f"{source}: an object must have a volume (got a flat mesh): give it a thickness, or bake an environment"
-        )
-    if not _MIN_SIZE <= size <= _MAX_SIZE:
-        raise InputError(f"{source}: a mesh must be {_MIN_SIZE:g} to {_MAX_SIZE:g} m across (got {size:.3g} m)")
-
-
-def _check_size(source: str, size: float, metres_per_unit: float) -> None:
-    """Refuse objects whose size [m] indicates wrong units."""
-    if _MIN_OBJECT_SIZE <= size <= _MAX_OBJECT_SIZE:
-        return
-    factor, unit = (0.001, "millimetres") if size > _MAX_OBJECT_SIZE else (1000.0, "metres")
-    likely = ""
-    if _MIN_OBJECT_SIZE <= size * factor <= _MAX_OBJECT_SIZE:
-        likely = f"--units {metres_per_unit * factor:g} reads it in {unit}, and "
-    raise InputError(
-        f"{source}: an object must be {_MIN_OBJECT_SIZE:g} to {_MAX_OBJECT_SIZE:g} m across (got {size:.3g} m at "
-        f"{metres_per_unit:g} metres per unit: {likely}--any-size accepts the size)"
-    )
-
-
-def _is_flat(mesh: trimesh.Trimesh) -> bool:
-    """Return True if all vertices lie in one plane, within a millionth of the size."""
-    offsets = mesh.vertices - mesh.vertices.mean(axis=0)
-    _, axes = np.linalg.eigh(offsets.T @ offsets)
-    extents = np.ptp(offsets @ axes, axis=0)
-    return bool(extents.min() < _FLAT * extents.max())
 
 
 def _visible_surfels(clay: mi.Scene, surfels: Surfels, rng: np.random.Generator) -> BoolArray:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsplat.bake.bake import BakeResult
+from mitsplat.bake.size_checks import describe_size
 from mitsplat.bake.verification import BakedView
 from mitsplat.geometry.decomposition import max_gap
 from mitsplat.geometry.mesh import mass_properties
@@ -38,7 +39,7 @@ def _figures(result: BakeResult) -> str:
         "Brightness relative to the file's textures": figure_of(result.brightness, "{:.2f}"),
     }
     if asset.mesh is not None:
-        rows["Size"] = " x ".join(f"{1e3 * extent:.4g}" for extent in asset.mesh.extents) + " mm"
+        rows["Size"] = describe_size(asset.mesh)
         rows["Mesh"] = f"{len(asset.mesh.faces)} faces, {'watertight' if asset.mesh.is_watertight else 'open'}"
         if asset.pieces:
             mass = mass_properties(asset.mesh, asset.pieces, density=asset.density, mass=asset.mass)

@@ -100,6 +100,7 @@ def bake(
     """
     from mitsplat.bake.bake import BakeSettings, bake_asset
     from mitsplat.bake.bake_report import write_bake_report
+    from mitsplat.bake.size_checks import describe_size
     from mitsplat.bake.surface_materials import SurfaceFinish
     from mitsplat.mesh_files.step import STEP_SUFFIXES, read_step, separate_parts
 
@@ -148,6 +149,8 @@ def bake(
         for warning in result.warnings:
             typer.echo(f"warning: {warning}")
         typer.echo(f"units of the mesh: {result.units}")
+        if result.asset.mesh is not None:
+            typer.echo(f"size: {describe_size(result.asset.mesh)}")
         typer.echo(f"report: {report}")
         typer.echo(f"asset: {folder} ({len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB on unseen views)")
 

@@ -168,10 +168,21 @@ def test_commands_refuse_misspelt_formats_and_other_files_with_a_hint(
             "radians?",
         ),
         (
-            {"camera": {"kind": "fixed", "eye": [0, 0, 1], "target": [0, 0, 0], "jitter": 2}},
-            "camera.jitter: it is 2 m",
+            {"camera": {"kind": "fixed", "eye": [0, 0, 1], "target": [0, 0, 0], "jitter": 1}},
+            "camera.jitter: it is 1 m, at 0.89 m",
             "millimetres?",
         ),
+        (
+            {"camera": {"kind": "path", "keys": [{"eye": [0, 0, 1], "target": [0, 0, 0]}], "jitter": 0.5}},
+            "camera.jitter: it is 0.5 m, at 1 m",
+            "millimetres?",
+        ),
+        (
+            {"camera": {"kind": "orbit", "target": [0, 0, 0], "radius": 3, "height": 4, "jitter": 2}},
+            "camera.jitter: it is 2 m, at 5 m",
+            "millimetres?",
+        ),
+        ({"camera": HEMISPHERE | {"target_jitter": 0.5}}, "camera.target_jitter: it is 0.5 m, at", "millimetres?"),
         ({"lights": [{"kind": "spot", "position": [0, 0, 2], "cone": 0.5}]}, "lights[0].cone: it is 0.5", "radians?"),
         ({"backdrop": {"size": [5000, 5000, 2800]}}, "backdrop.size: it is up to 5000 m", "millimetres?"),
         (

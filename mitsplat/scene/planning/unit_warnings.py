@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from mitsplat.findings import Finding
-from mitsplat.scene.spec.camera_spec import CameraHemisphere, CameraOrbit
+from mitsplat.scene.spec.camera_spec import CameraHemisphere, CameraOrbit, CameraPath
 from mitsplat.scene.spec.light_spec import DrawnLight, EnvironmentLight, LocalLight, SpotLight
 from mitsplat.scene.spec.scene_spec import SceneSpec
 
@@ -19,6 +19,8 @@ MAX_COLOUR = 16.0
 """Largest plausible factor of the colour of a light."""
 MAX_ROOM, MAX_JITTER = 200.0, 1.0
 """Largest plausible edge of a backdrop, and standard deviation of a random displacement [m]."""
+MAX_CAMERA_JITTER = 0.3
+"""Largest plausible standard deviation of a camera's position, as a fraction of its distance from the target."""
 MAX_EXPOSURE, MAX_SPEED, MAX_INTERVAL = 1.0, 10.0, 120.0
 """Largest plausible exposure [s] and belt speed [m/s], and time between two images of a belt [s]."""
 RADIAN_STEPS, RADIAN_DIGITS = (np.pi / 4, np.pi / 6), 0.006
@@ -60,12 +62,27 @@ def _length_warnings(spec: SceneSpec) -> Iterator[Finding]:
         if shape.jitter > MAX_JITTER:
             text = f"shapes[{number}].jitter: it is {shape.jitter:g} m"
             yield Finding("shape", False, text, "is it in millimetres?")
+    away = _camera_distance(spec)
     for key in ("jitter", "target_jitter"):
-        if (jitter := getattr(spec.camera, key, 0.0)) > MAX_JITTER:
-            yield Finding("views", False, f"camera.{key}: it is {jitter:g} m", "is it in millimetres?")
+        if (jitter := getattr(spec.camera, key, 0.0)) > MAX_CAMERA_JITTER * away:
+            text = f"camera.{key}: it is {jitter:g} m, at {away:.3g} m from camera to target"
+            yield Finding("views", False, text, "is it in millimetres?")
     if spec.backdrop is not None and max(spec.backdrop.size) > MAX_ROOM:
         text = f"backdrop.size: it is up to {max(spec.backdrop.size):.4g} m"
         yield Finding("backdrop", False, text, "is it in millimetres?")
+
+
+def _camera_distance(spec: SceneSpec) -> float:
+    """Return the largest distance of the camera from what it looks at [m], without jitter."""
+    camera = spec.camera
+    if isinstance(camera, CameraHemisphere):
+        return camera.radius[1]
+    if isinstance(camera, CameraOrbit):
+        return float(np.hypot(camera.radius, camera.height))
+    if isinstance(camera, CameraPath):
+        return max(float(np.linalg.norm(np.subtract(key.eye, key.target))) for key in camera.keys)
+    middle = np.add(spec.region.min, spec.region.max) / 2
+    return float(np.linalg.norm(camera.pose[:3, 3] - middle))
 
 
 def _time_warnings(spec: SceneSpec) -> Iterator[Finding]:

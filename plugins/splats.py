@@ -13,6 +13,7 @@ from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import specular_of
+from mitsplat.geometry.rigid import split_similarity
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.renderer.materials.proxy_materials import GlossChange
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
@@ -203,10 +204,10 @@ def _matrix(props: mi.Properties) -> np.ndarray:
     if "to_world" not in props:
         return np.eye(4)
     matrix = np.array(props["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-    gram = matrix[:3, :3].T @ matrix[:3, :3]
-    scale = np.trace(gram) / 3
-    if np.linalg.det(matrix[:3, :3]) <= 0 or np.abs(gram - scale * np.eye(3)).max() > 1e-4 * scale:
-        raise InputError("shape 'splats': 'to_world' must be a rotation, a translation and a uniform scale")
+    try:
+        split_similarity(matrix)
+    except InputError as error:
+        raise InputError(f"shape 'splats': 'to_world': {error}") from None
     return matrix
 
 

@@ -57,7 +57,7 @@ STORED = CAMERA.to_json()
         (lambda: CAMERA.cropped(0.5, 0, 8, 8), r"left must be a whole number \(got float 0\.5\)"),
         (lambda: CAMERA.transformed("x"), r"matrix must be an array of numbers \(got str 'x'\)"),
         (lambda: CAMERA.transformed(np.diag([-1, 1, 1, 1])), "must neither mirror nor flatten"),
-        (lambda: CAMERA.transformed(np.zeros((4, 4))), "must neither mirror nor flatten"),
+        (lambda: CAMERA.transformed(np.diag([0, 0, 0, 1])), "must neither mirror nor flatten"),
         (lambda: CAMERA.project({}), "points must be an array of numbers"),
         (lambda: CAMERA.project([[0, 0], [1]]), "points must be an array of numbers"),
         (lambda: CAMERA.ray_slopes(np.zeros((2, 3))), r"pixels must have shape \(N, 2\) \(got \(2, 3\)\)"),

@@ -27,6 +27,7 @@ from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from mitsplat.errors import InputError, checks_arguments
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.lens import Lens
+from mitsplat.geometry.rigid import split_similarity
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.file_kinds import no_folder_with
@@ -320,16 +321,11 @@ class Capture:
         Raises:
             ValueError: If the matrix shears, mirrors or scales unevenly.
         """
-        matrix = np.asarray(matrix, dtype=np.float64)
-        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        if not (
-            scale > 0 and np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, scale**2 * np.eye(3), atol=1e-9 * scale**2)
-        ):
-            raise ValueError("a capture is moved by rotation, uniform scale and translation only")
+        rotation, scale, translation = split_similarity(matrix)
         return replace(
             self,
             photos=tuple(replace(photo, camera=photo.camera.transformed(matrix)) for photo in self.photos),
-            points=self.points @ matrix[:3, :3].T + matrix[:3, 3],
+            points=self.points @ (scale * rotation).T + translation,
             table=False,
         )
 

@@ -23,12 +23,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from mitsplat.arrays import AnyArray, BoolArray, Float32Array, Float64Array
+from mitsplat.arrays import AnyArray, BoolArray, Float32Array
 from mitsplat.errors import InputError, checks_arguments, describe, path_of
 from mitsplat.gaussians.material_files import read_materials
 from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_rotation
 from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
 from mitsplat.gaussians.splat_materials import MAX_SPECULAR, SplatMaterials
+from mitsplat.geometry.rigid import split_similarity
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.quality import KernelName
 
@@ -211,28 +212,6 @@ class Splats:
         joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
         kernels = {part.kernel for part in parts}
         return Splats(**joined, sh=np.concatenate(padded), kernel=kernels.pop() if len(kernels) == 1 else None)
-
-
-def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float64Array]:
-    """Return rotation (3, 3), uniform scale and translation (3,) of a similarity transform (4, 4).
-
-    Raises:
-        ValueError: If the matrix is not finite, or not a rotation with a uniform scale and a translation.
-    """
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.array_equal(matrix[3], (0, 0, 0, 1)):
-        raise ValueError("a transform must be a finite 4x4 matrix whose last row is 0 0 0 1")
-    linear = matrix[:3, :3]
-    determinant = float(np.linalg.det(linear))
-    if determinant <= 0:
-        raise ValueError(f"a transform must neither mirror nor flatten (got determinant {determinant:.6g})")
-    scale = float(np.cbrt(determinant))
-    rotation = linear / scale
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > 1e-4:
-        raise ValueError(f"a transform must scale uniformly and not shear (R R^T differs from 1 by {error:.3g})")
-    u, _, vt = np.linalg.svd(rotation)  # nearest rotation: inputs are often float32
-    return u @ vt, scale, matrix[:3, 3]
 
 
 def _rows_of(index: npt.ArrayLike, count: int) -> AnyArray:

@@ -27,7 +27,7 @@ from mitsplat.geometry.lens import (
     lens_fault,
     undistort,
 )
-from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, points_of, rigid_matrix
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, points_of, rigid_matrix, split_similarity
 from mitsplat.storage.files import JsonObject
 
 MAX_IMAGE_SIDE = 16384
@@ -263,15 +263,15 @@ class Camera:
         return self.resized(max(1, round(self.width * scale)), max(1, round(self.height * scale)))
 
     def transformed(self, matrix: npt.ArrayLike) -> Camera:
-        """Return the camera after a similarity transform (4, 4). The near distance is scaled."""
-        matrix = np.asarray(matrix, dtype=np.float64)
-        if matrix.shape != (4, 4):
-            raise ValueError(f"matrix must have shape (4, 4) (got {matrix.shape})")
-        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        if not (scale > 0 and np.isfinite(matrix).all()):
-            raise InputError(f"matrix must be finite and must neither mirror nor flatten (got a scale of {scale:g})")
-        pose = matrix @ self.world_from_camera
-        pose[:3, :3] /= scale
+        """Return the camera after a similarity transform (4, 4). The near distance is scaled.
+
+        Raises:
+            InputError: If the matrix shears, mirrors or scales unevenly.
+        """
+        rotation, scale, translation = split_similarity(matrix)
+        pose = np.eye(4)
+        pose[:3, :3] = rotation @ self.world_from_camera[:3, :3]
+        pose[:3, 3] = scale * rotation @ self.centre + translation
         return replace(self, world_from_camera=pose, near=self.near * scale)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:

@@ -12,6 +12,8 @@ from mitsplat.errors import InputError, describe
 
 RIGID = 1e-5
 """Maximum absolute entry of R R^T - 1. Rotations in single precision pass; scales do not."""
+SIMILAR = 1e-4
+"""Maximum absolute entry of R R^T - 1 of a similarity transform without its scale."""
 Z_UP_FROM_Y_UP = np.array([(1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)])
 """Transform (4, 4) from axes with y up, as in glTF, to those with z up."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -54,6 +56,37 @@ def rigid_matrix(pose: npt.ArrayLike, frames: str, *, tolerance: float = RIGID) 
         got += f" with an angle of {np.degrees(np.arccos(min(1.0, cosines.max()))):.4g} degrees between two of them"
         cause = "are its entries rounded, or rows and columns mixed up?"
     raise ValueError(f"must be a rotation and a translation, without scale or mirror (got {got}); {cause}")
+
+
+def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float64Array]:
+    """Return rotation (3, 3), uniform scale and translation (3,) of a similarity transform (4, 4).
+
+    The rotation is the nearest to the given one, because matrices are often stored in single precision.
+
+    Raises:
+        InputError: If the matrix is not finite, or not a rotation with a uniform scale and a translation.
+    """
+    try:
+        values = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (4, 4) or not np.isfinite(values).all():
+        raise InputError(f"a transform must be a finite 4x4 matrix (got {_describe(matrix)})")
+    if np.abs(values[3] - (0, 0, 0, 1)).max() > RIGID:
+        cause = "is it transposed, with the translation there?" if values[3, :3].any() else "is it scaled?"
+        raise InputError(f"a transform must have the last row 0 0 0 1 (got {values[3].tolist()}): {cause}")
+    linear = values[:3, :3]
+    determinant = float(np.linalg.det(linear))
+    if determinant <= 0:
+        cause = "is one axis inverted, or are two exchanged?" if determinant else "is an axis missing?"
+        raise InputError(f"a transform must neither mirror nor flatten (got determinant {determinant:.6g}): {cause}")
+    scale = float(np.cbrt(determinant))
+    rotation = linear / scale
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > SIMILAR:
+        lengths = ", ".join(f"{length:.6g}" for length in np.linalg.norm(linear, axis=0))
+        raise InputError(f"a transform must scale uniformly and not shear (got axes of lengths {lengths})")
+    u, _, vt = np.linalg.svd(rotation)
+    return u @ vt, scale, values[:3, 3]
 
 
 def nearest_rigid(matrix: Float64Array) -> Float64Array:

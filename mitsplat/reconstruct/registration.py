@@ -19,9 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
-from mitsplat.gaussians.splat_cloud import Splats, split_similarity
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
+from mitsplat.geometry.rigid import split_similarity
 from mitsplat.renderer.layers import render_splats
 
 _OPAQUE = 0.9
@@ -105,7 +106,7 @@ def invert_transform(path: Path) -> Float64Array:
         raise InputError(f"{path}: must hold 3 or 4 rows of 4 numbers ({error})") from error
     if matrix.shape == (3, 4):
         matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
-    if matrix.shape != (4, 4) or not np.allclose(matrix[3], (0, 0, 0, 1)):
+    if matrix.shape != (4, 4):
         raise InputError(f"{path}: must be an affine 3 x 4 or 4 x 4 matrix (got shape {matrix.shape})")
     try:
         split_similarity(matrix)

@@ -17,6 +17,7 @@ from scipy.ndimage import binary_closing, binary_opening, label
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.geometry.camera import direction
+from mitsplat.geometry.rigid import split_similarity
 from mitsplat.importing.upright import POINTS, largest_plane, rotation_to_z
 from mitsplat.surroundings.depth_views import SurfacePoints
 
@@ -88,9 +89,10 @@ class Support:
 
     def transformed(self, motion: Float64Array) -> Support:
         """Return the support after a similarity transform (4, 4)."""
-        scale = float(np.cbrt(np.linalg.det(motion[:3, :3])))
-        pose = motion @ self.pose
-        pose[:3, :3] /= scale
+        rotation, scale, translation = split_similarity(motion)
+        pose = np.eye(4)
+        pose[:3, :3] = rotation @ self.pose[:3, :3]
+        pose[:3, 3] = scale * rotation @ self.pose[:3, 3] + translation
         return Support(
             pose,
             (scale * self.size[0], scale * self.size[1]),

@@ -17,10 +17,11 @@ from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.asset import Asset, AssetSpec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import encode_sh
-from mitsplat.gaussians.splat_cloud import Splats, split_similarity
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.geometry.mesh import mass_properties, prepare_mesh
+from mitsplat.geometry.rigid import split_similarity
 from mitsplat.storage.files import JsonObject
 from mitsplat.usd.stage_physics import Record
 from mitsplat.usd.stage_records import read_records

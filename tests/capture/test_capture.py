@@ -123,7 +123,7 @@ def test_a_transformed_capture_keeps_the_pixels_of_its_points(capture: Capture) 
         np.testing.assert_allclose(depth_after, 2.5 * depth, atol=1e-9)
         np.testing.assert_allclose(pixels_after, pixels, rtol=1e-6, atol=1e-6)
         assert after.camera.near == pytest.approx(2.5 * before.camera.near)
-    with pytest.raises(ValueError, match="uniform scale"):
+    with pytest.raises(ValueError, match="scale uniformly"):
         capture.transformed(np.diag([1, 1, 2, 1]))
 
 

@@ -20,11 +20,13 @@ _KEPT = (b"map_", b"mtllib")
 """Beginnings of the keys whose values are file names."""
 _NAMES = (b"usemtl", b"newmtl", b"g", b"o")
 """Keys whose values may contain the character that begins a comment."""
+_PAINT = re.compile(rb"^\s*#MRGB\s+(?:[0-9a-fA-F]{8})+\s*$")
 _COLOURED = re.compile(rb"^v(?: \S+){3}((?: \S+){3})$", re.M)
 _ODD_VERTEX = re.compile(rb"^v(?: \S+){5}$|^v(?: \S+){7,}$", re.M)
 _LEFT_OUT = {
     rb"^(?:curv|curv2|surf) ": "its free-form curves and surfaces are left out",
     rb"^[lp] ": "its points and lines are left out",
+    rb"^#MRGB": "the colours of its vertices (#MRGB) are left out, because their number is not that of the vertices",
     rb"^call ": "the files that it calls are left out",
 }
 
@@ -37,7 +39,25 @@ def plain_text(content: bytes) -> bytes:
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         content = content.decode("utf-16").encode()
     lines = _CONTINUATION.sub(b" ", content.removeprefix(codecs.BOM_UTF8)).splitlines()
-    return b"\n".join(map(_plain_line, lines)) + b"\n"
+    painted = [line.split(maxsplit=1)[1].strip() for line in lines if _PAINT.match(line)]
+    return b"\n".join(_painted_lines([_plain_line(line) for line in lines], b"".join(painted))) + b"\n"
+
+
+def _painted_lines(lines: list[bytes], colours: bytes) -> list[bytes]:
+    """Return lines whose vertices have the colours of ZBrush's polypaint, eight digits MMRRGGBB a vertex (M: mask).
+
+    Colours that do not fit the vertices stay a comment.
+    """
+    vertices = [number for number, line in enumerate(lines) if line.startswith(b"v ")]
+    if not colours:
+        return lines
+    if len(colours) != 8 * len(vertices) or any(len(lines[number].split()) != 4 for number in vertices):
+        return [*lines, b"#MRGB"]
+    values = np.frombuffer(bytes.fromhex(colours.decode()), np.uint8).reshape(-1, 4)[:, 1:] / 255.0
+    painted = list(lines)
+    for number, colour in zip(vertices, values, strict=True):
+        painted[number] += b" %.6f %.6f %.6f" % tuple(colour)
+    return painted
 
 
 def _plain_line(line: bytes) -> bytes:

@@ -408,6 +408,8 @@ def _read_mtl(source: SimpleMaterial, uv: Float64Array | None) -> Material:
     opacity, transparency = _numbers(keys, "d"), _numbers(keys, "tr")
     if (opacity is not None and opacity[-1] < OPAQUE) or (transparency is not None and transparency[0] > 1 - OPAQUE):
         warnings.append("it is transparent, but is baked as opaque")
+    elif "tf" in keys and not ((passed := _numbers(keys, "tf")) is not None and np.isin(passed, (0, 1)).all()):
+        warnings.append("it transmits light (Tf), but is baked as opaque")
     emission = _numbers(keys, "ke")
     if "map_ke" in keys or (emission is not None and emission.any()):
         warnings.append("it emits light, which is not baked")

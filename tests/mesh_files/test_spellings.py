@@ -65,6 +65,8 @@ RED = "newmtl red\nKd 1 0 0\n"
         (obj(use="usemtl  dark   red\t"), "newmtl dark  red\nKd 1 0 0\n"),
         (obj(use="usemtl red#1"), "newmtl red#1\nKd 1 0 0\n"),
         (obj(), RED + "Ks 0\nKa 0.5\n"),
+        (obj(), RED + "Tf 1 1 1\n"),  # written for opaque materials, as 0 0 0
+        (obj(), RED + "Tf 0\n"),
     ],
 )
 def test_spellings_of_obj_give_the_same_mesh(tmp_path: Path, text: str, library: str) -> None:
@@ -99,6 +101,11 @@ def test_colours_of_mtl_that_are_no_rgb_are_refused(tmp_path: Path, colour: str)
         (obj() + "surf 0 1 0 1 1 2 3 4\n", RED, "free-form curves and surfaces are left out"),
         (obj() + "call b.obj\n", RED, "files that it calls are left out"),
         (obj(), RED + "d -halo 0.3\n", "is transparent"),
+        (obj(), RED + "Tf 0.2 0.8 0.9\n", "transmits light (Tf)"),
+        (obj(), RED + "Tf 0.5\n", "transmits light (Tf)"),
+        (obj(), RED + "Tf spectral a.rfl\n", "transmits light (Tf)"),
+        (obj() + "#MRGB ff0000ffff0000ff\n", RED, "(#MRGB) are left out, because their number"),
+        (obj() + "#MRGB ff0000ffff0000ff\n#MRGB ff00ff00ffff0000\n", RED, "because its faces have materials"),
         (obj(), RED + "map_Ka a.png\n", "map_ka is left out"),
         (obj(), RED + "disp a.png\n", "disp is left out"),
         (obj(), "newmtl red\nKa 1 0 0\n", "it has no Kd"),
@@ -110,6 +117,27 @@ def test_what_is_not_read_of_obj_is_named(tmp_path: Path, text: str, library: st
     model = read_model(tmp_path / "a.obj")
     (warning,) = (*model.warnings, *(warning for part in model.parts for warning in part.warnings))
     assert sentence in warning and is_complete(model)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_colours_of_polypaint_are_those_of_its_vertices(tmp_path: Path, end: str) -> None:
+    """ZBrush writes MMRRGGBB for each vertex, with a mask MM."""
+    colours = [(255, 0, 0), (0, 128, 255), (10, 20, 30), (200, 100, 50)]
+    digits = ["{:02x}{:02X}{:02x}{:02X}".format(number, *colour) for number, colour in enumerate(colours)]
+    paint = f"#MRGB {digits[0]}{digits[1]}{end} #MRGB {digits[2]}{digits[3]} {end}"
+    text = obj(use="").replace("mtllib a.mtl\n", "").replace("\n", end)
+    (tmp_path / "a.obj").write_bytes((text + paint).encode())
+    model = read_model(tmp_path / "a.obj")
+    (part,) = model.parts
+    assert is_complete(model) and model.warnings == part.warnings == () and part.colours is not None
+    shades = np.rint(255 * encode_srgb(part.colours)).astype(int)
+    found = {
+        (tuple(corner), tuple(colour))
+        for corner, colour in zip(
+            part.mesh.triangles.reshape(-1, 3).tolist(), shades.reshape(-1, 3).tolist(), strict=True
+        )
+    }
+    assert found == set(zip(POINTS, colours, strict=True))
 
 
 def test_colours_of_vertices_of_obj_are_fractions(tmp_path: Path) -> None:

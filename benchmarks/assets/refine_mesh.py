@@ -49,8 +49,7 @@ def masked(mesh: trimesh.Trimesh, cameras: list[Camera], finer: int = 4) -> list
     for camera in cameras:
         fine = camera.resized(finer * camera.width, finer * camera.height)
         y, x = np.mgrid[: fine.height, : fine.width] + 0.5
-        slopes = fine.ray_slopes(np.column_stack([x.ravel(), y.ravel()]))
-        ahead = np.column_stack([slopes, np.ones(len(slopes))]) @ camera.world_from_camera[:3, :3].T
+        ahead = fine.rays(np.column_stack([x.ravel(), y.ravel()])) @ camera.world_from_camera[:3, :3].T
         ray = mi.Ray3f(mi.Point3f(camera.centre), mi.Vector3f(np.ascontiguousarray(ahead.T, dtype=np.float32)))
         hit = np.array(scene.ray_test(ray)).reshape(camera.height, finer, camera.width, finer)
         views.append(MaskedView(camera, hit.mean(axis=(1, 3)).astype(np.float32)))

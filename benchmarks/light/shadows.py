@@ -86,8 +86,7 @@ class Photographer:
             scene = mitsuba_scene(parts, lights, clay=clay)
             fine = camera.resized(camera.width * side, camera.height * side)
             x, y = np.meshgrid(np.arange(fine.width) + 0.5, np.arange(fine.height) + 0.5)
-            slopes = fine.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
-            rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
+            rays = fine.rays(np.stack([x.ravel(), y.ravel()], axis=1)) @ camera.world_from_camera[:3, :3].T
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
             origins = np.broadcast_to(camera.centre, rays.shape)
             radiance, hit = trace_radiance(scene, origins, rays, samples=samples, bounces=bounces, seed=1)

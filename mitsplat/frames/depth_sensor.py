@@ -127,8 +127,7 @@ def simulate_time_of_flight(
     """
     height, width = depth.shape
     rows, columns = np.mgrid[:height, :width]
-    slopes = camera.ray_slopes(np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1))
-    rays = np.column_stack([slopes, np.ones(len(slopes))]).reshape(height, width, 3)
+    rays = camera.rays(np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)).reshape(height, width, 3)
     length = np.linalg.norm(rays, axis=-1)
     distance = depth * length
     facing = np.abs(np.einsum("hwi,hwi->hw", normal @ camera.world_from_camera[:3, :3], rays)) / length

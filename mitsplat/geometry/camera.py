@@ -347,9 +347,8 @@ class Camera:
         cx, cy = (-low * (fx, fy)).tolist()
         pinhole = replace(self, fx=float(fx), fy=float(fy), cx=cx, cy=cy, distortion=(), lens="opencv")
         columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
-        slopes = pinhole.ray_slopes(np.stack([columns.ravel(), rows.ravel()], axis=1))
         at_origin = replace(self, world_from_camera=np.eye(4))
-        at, _ = at_origin.project(np.column_stack([slopes, np.ones(len(slopes))]))
+        at, _ = at_origin.project(pinhole.rays(np.stack([columns.ravel(), rows.ravel()], axis=1)))
         # OpenCV has pixel centres at whole numbers.
         x, y = (at - 0.5).astype(np.float32).T.reshape(2, self.height, self.width)
         pixels = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -368,6 +367,22 @@ class Camera:
         if not self.distortion or not len(slopes):
             return slopes
         return undistort(slopes, self.distortion, self.lens)
+
+    def rays(self, pixels: npt.ArrayLike) -> Float64Array:
+        """Return ray directions ``(x / z, y / z, 1)`` in camera space, shape (N, 3), of pixel positions (N, 2)."""
+        slopes = self.ray_slopes(pixels)
+        return np.column_stack([slopes, np.ones(len(slopes))])
+
+    def unproject(self, pixels: npt.ArrayLike, depth: npt.ArrayLike) -> Float64Array:
+        """Return the world points [m], shape (N, 3), at pixel positions (N, 2) and depths along z [m], shape (N,).
+
+        This is the inverse of :meth:`project`. Points are NaN for positions for which the lens has no ray.
+        """
+        rays, depths = self.rays(pixels), np.reshape(depth, (-1, 1))
+        if len(depths) != len(rays):
+            raise InputError(f"depth must have one value for each pixel (got {len(depths)} for {len(rays)} pixels)")
+        local = rays * depths
+        return np.asarray(local @ self.world_from_camera[:3, :3].T + self.centre)
 
 
 def direction(azimuth: float, sine: float) -> Float64Array:

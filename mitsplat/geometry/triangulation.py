@@ -23,8 +23,8 @@ def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64A
     observations = list(observations)
     while len(observations) >= 3:
         cameras = [camera for camera, _ in observations]
-        slopes = np.array([np.append(c.ray_slopes([p])[0], 1.0) for c, p in observations])
-        rays = np.array([c.world_from_camera[:3, :3] @ slope for c, slope in zip(cameras, slopes, strict=True)])
+        local_rays = np.array([camera.rays([pixel])[0] for camera, pixel in observations])
+        rays = np.array([c.world_from_camera[:3, :3] @ ray for c, ray in zip(cameras, local_rays, strict=True)])
         centres = np.array([camera.centre for camera in cameras])
         start = nearest_point_to_lines(centres, rays / np.linalg.norm(rays, axis=1, keepdims=True))
         poses = np.array([camera.camera_from_world for camera in cameras])
@@ -33,7 +33,7 @@ def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64A
         def residuals(point: Float64Array, poses: Float64Array = poses, focal: Float64Array = focal) -> Float64Array:
             local = poses[:, :3, :3] @ point + poses[:, :3, 3]
             depth = np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:])
-            return np.asarray(((local[:, :2] / depth - slopes[:, :2]) * focal).ravel())  # noqa: B023 - used at once
+            return np.asarray(((local[:, :2] / depth - local_rays[:, :2]) * focal).ravel())  # noqa: B023 - used at once
 
         point = least_squares(residuals, start, loss="soft_l1").x
         errors = np.linalg.norm(residuals(point).reshape(-1, 2), axis=1)

@@ -40,10 +40,8 @@ def optical_flow(
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-    z = np.asarray(depth, dtype=np.float64).reshape(-1, 1)
-    known = z[:, 0] > 0
-    pose = camera.world_from_camera
-    points = np.concatenate([camera.ray_slopes(pixels) * z, z], axis=1) @ pose[:3, :3].T + pose[:3, 3]
+    known = depth.ravel() > 0
+    points = camera.unproject(pixels, depth)
     for instance, motion in (motions or {}).items():
         mask = np.ravel(ids == instance)
         if motion is None:

@@ -167,9 +167,7 @@ def _directions(capture: Capture) -> str:
 def _frustum(photo: Photo, at: Callable[[Float64Array], Float64Array], depth: float) -> str:
     camera = photo.camera
     corners = np.array([(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)], dtype=float)
-    slopes = np.concatenate([camera.ray_slopes(corners), np.ones((4, 1))], axis=1) * depth
-    world = np.concatenate([[camera.centre], slopes @ camera.world_from_camera[:3, :3].T + camera.centre])
-    eye, *base = at(world).tolist()
+    eye, *base = at(np.concatenate([[camera.centre], camera.unproject(corners, np.full(4, depth))])).tolist()
     rays = "".join(f"M{eye[0]:.1f} {eye[1]:.1f}L{x:.1f} {y:.1f}" for x, y in base)
     ring = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in base) + "Z"
     return f'<path class="camera" d="{rays}{ring}"><title>{html.escape(photo.name)}</title></path>'

@@ -81,9 +81,7 @@ def surface_points(splats: Splats, cameras: Sequence[Camera]) -> Float64Array:
     for camera in cameras:
         layers = render_splats(splats, camera, quality="fast")
         y, x = np.nonzero((layers.alpha > _OPAQUE) & (layers.depth > 0))
-        slopes = camera.ray_slopes(np.stack([x + 0.5, y + 0.5], axis=1))
-        local = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * layers.depth[y, x, None]
-        points.append(local @ camera.world_from_camera[:3, :3].T + camera.centre)
+        points.append(camera.unproject(np.stack([x + 0.5, y + 0.5], axis=1), layers.depth[y, x]))
     found: Float64Array = np.concatenate([np.zeros((0, 3)), *points])
     if not len(found):
         raise InputError("the splats show no opaque surface to the cameras: do the splats belong to this capture?")

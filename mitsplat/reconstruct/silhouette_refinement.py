@@ -207,8 +207,7 @@ class Outline:
         pose = look_at_pose(given.centre, middle, -given.world_from_camera[:3, 1])
         camera = Camera(size, size, self.focal, self.focal, 0.5 * size, 0.5 * size, pose)
         y, x = np.mgrid[:size, :size] + 0.5
-        slopes = camera.ray_slopes(np.column_stack([x.ravel(), y.ravel()]))
-        ahead = np.column_stack([slopes, np.ones(len(slopes))]) @ pose[:3, :3].T
+        ahead = camera.rays(np.column_stack([x.ravel(), y.ravel()])) @ pose[:3, :3].T
         # Pixel centres are at +0.5 here, but at integers in OpenCV.
         pixels = np.nan_to_num(given.project(given.centre + distance * ahead)[0], nan=-9.0) - 0.5
         known = ((pixels > -0.5) & (pixels < np.array([given.width, given.height]) - 0.5)).all(axis=1)

@@ -91,8 +91,7 @@ def surface_points(views: Sequence[DepthView]) -> SurfacePoints:
     for view in views:
         height, width = view.depth.shape
         y, x = np.mgrid[0:height, 0:width] + 0.5
-        slopes = view.camera.ray_slopes(np.stack([x.ravel(), y.ravel()], axis=1))
-        rays = np.column_stack([slopes, np.ones(len(slopes))]).reshape(height, width, 3)
+        rays = view.camera.rays(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(height, width, 3)
         depth = np.where(np.isfinite(view.depth), view.depth, np.nan).astype(np.float64)
         local = rays * depth[..., None]
         step, inner = 2 * _STEP, slice(_STEP, -_STEP)

@@ -239,9 +239,8 @@ def _find_pick(
     """Return the index of the support below the object at a pixel, and the position (3,) in the support's frame."""
     photo, pixel = capture.picked(pick)
     camera = photo.camera
-    ray = np.append(camera.ray_slopes([pixel])[0], 1.0)
     (view,) = depth_views(splats, [camera])
-    ray = ray @ camera.world_from_camera[:3, :3].T
+    ray = camera.world_from_camera[:3, :3] @ camera.rays([pixel])[0]
     depth = float(view.depths_at((camera.centre + scale * ray)[None])[1][0])
     spot = camera.centre + (depth if np.isfinite(depth) else np.nan) * ray  # NaN stands on no support
     found, lowest = -1, np.inf

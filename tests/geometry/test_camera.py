@@ -44,6 +44,15 @@ def test_rays_of_a_fisheye_project_to_their_pixels(distortion: tuple[float, ...]
     np.testing.assert_allclose(back, pixels, atol=1e-6)
 
 
+def test_unprojected_points_project_to_their_pixels_and_depths() -> None:
+    camera = replace(FISHEYE, distortion=BENT, world_from_camera=look_at_pose((1, 2, 3), (0, 0.2, 0.1)))
+    rng = np.random.default_rng(0)
+    pixels, depth = rng.uniform((0, 0), (640, 480), (50, 2)), rng.uniform(0.1, 5, 50)
+    back, z = camera.project(camera.unproject(pixels, depth))
+    np.testing.assert_allclose(back, pixels, atol=1e-6)
+    np.testing.assert_allclose(z, depth, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [

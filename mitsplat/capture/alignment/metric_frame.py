@@ -179,8 +179,8 @@ def spot(model: SparseModel, name: str) -> Float64Array:
     # Observed points need not lie on the pixel: use the ray of the pixel and the depth of the nearest points.
     weights = 1 / (gaps[near] + 1)
     depth = float(depths[near] @ weights / weights.sum())
-    ray = np.append(camera.ray_slopes([(x, y)])[0], 1.0) * depth
-    return np.asarray(camera.world_from_camera[:3, :3] @ ray + camera.centre)
+    point: Float64Array = camera.unproject([(x, y)], [depth])[0]
+    return point
 
 
 def find_table(model: SparseModel) -> tuple[Float64Array, Float64Array] | None:

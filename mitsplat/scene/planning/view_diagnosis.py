@@ -29,9 +29,8 @@ def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
     if shown.any():
         return True
     across = np.stack(np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 17)), axis=-1)
-    slopes = camera.ray_slopes(across.reshape(-1, 2))
     # The directions have depth 1, so the ray parameter is the depth.
-    rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ camera.world_from_camera[:3, :3].T
+    rays = camera.rays(across.reshape(-1, 2)) @ camera.world_from_camera[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.stack([(low - camera.centre) / rays, (high - camera.centre) / rays])
     first, last = np.nanmax(ends.min(axis=0), axis=1), np.nanmin(ends.max(axis=0), axis=1)

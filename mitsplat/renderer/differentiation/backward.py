@@ -13,7 +13,7 @@ from mitsplat.quality import KERNELS, Quality
 from mitsplat.renderer.differentiation.record_gradients import PAIRS_AT_ONCE, march_backward, tile_gradient
 from mitsplat.renderer.projection.clouds import SCALE_RATIO_MIN, Cloud, CloudSet, Placement, placement_table
 from mitsplat.renderer.projection.projector import Projector
-from mitsplat.renderer.projection.records import RECORD, GaussianRecord, Geometry
+from mitsplat.renderer.projection.records import RECORD, GaussianRecord, Geometry, ViewRecords
 from mitsplat.renderer.rays.camera_rays import CameraView, Kind, ViewNumbers
 from mitsplat.renderer.splatting.lanes import Lanes
 from mitsplat.renderer.splatting.march import march
@@ -260,7 +260,7 @@ def render_records(
         CrowdedError: If there are too many pairs of a Gaussian and a tile.
     """
     _check(view, quality)
-    lists = bin_records(records, None, least, box, view, quality, _PLACEMENT.instance, for_gradients=True)
+    lists = bin_records(ViewRecords(records, None, least, box), view, quality, _PLACEMENT.instance, for_gradients=True)
     return (DepthRendering if depth else RenderOp)(lists, view, quality)
 
 

@@ -22,7 +22,7 @@ from mitsplat.renderer.projection.gaussian import (
     respond_at_plane,
     rotation_axes,
 )
-from mitsplat.renderer.projection.records import RECORD, GaussianRecord, Geometry, PlacementRow
+from mitsplat.renderer.projection.records import RECORD, GaussianRecord, Geometry, PlacementRow, ViewRecords
 from mitsplat.renderer.projection.splat_appearance import apply_appearance
 from mitsplat.renderer.rays.camera_rays import CameraView, Kind, ViewNumbers
 from mitsplat.renderer.rays.tile_subset import TileSubset
@@ -183,19 +183,13 @@ class Projector:
         dr.eval(visible, at_plane)
         return visible, at_plane
 
-    def records(
-        self, owner: mi.UInt32, local: mi.UInt32, at_plane: mi.Bool
-    ) -> tuple[mi.Float, mi.Float | None, mi.Float, mi.UInt32]:
+    def records(self, owner: mi.UInt32, local: mi.UInt32, at_plane: mi.Bool) -> ViewRecords:
         """Project Gaussians to view records.
 
         Args:
             owner: Placement row of each Gaussian.
             local: Number of each Gaussian in the clouds.
             at_plane: True for Gaussians that reach the camera's plane, from :meth:`cull`.
-
-        Returns:
-            View records, records of Gaussians at the camera's plane (None without any), least depths [m], and boxes of
-            tiles (x0, x1, y0, y1).
         """
         g = self._load(owner, local)
         bounds = self._bounds(g)
@@ -211,7 +205,7 @@ class Projector:
         records, tile_box = _rows(mi.Float, [*record]), _rows(mi.UInt32, self._tile_box(bounds))
         least = dr.detach(bounds.least_depth)
         dr.eval(records, tile_box, least)
-        return records, plane_records, least, tile_box
+        return ViewRecords(records, plane_records, least, tile_box)
 
     def all_records(self, owner: mi.UInt32, local: mi.UInt32) -> tuple[mi.Float, mi.Float, mi.UInt32, mi.Bool, mi.Bool]:
         """Return view records of all Gaussians, least depths, tile boxes, visibility, and flags of the camera's plane.
@@ -228,26 +222,21 @@ class Projector:
         at_plane = visible & dr.detach(bounds.at_plane)
         return _rows(mi.Float, [*record]), dr.detach(bounds.least_depth), boxes, visible, at_plane
 
-    def records_unculled(
-        self, owner: mi.UInt32, local: mi.UInt32
-    ) -> tuple[mi.Float, mi.Float | None, mi.Float, mi.UInt32]:
-        """Return the results of :meth:`records` for all Gaussians, with recorded kernels and without gradients.
-
-        Invisible Gaussians have empty boxes.
-        """
+    def records_unculled(self, owner: mi.UInt32, local: mi.UInt32) -> ViewRecords:
+        """Return the view records of all Gaussians, visible or not, with recorded kernels and without gradients."""
         clouds, view = self.clouds, self.view
         shape = self.quality, self.at_camera, self.changed, clouds.sh_count, clouds.sh_stride
         arrays = Table(clouds.geometry), Table(clouds.scales), Table(clouds.sh), Table(self.table)
         records, least, boxes, at_plane = _all_records(view.kind, view.numbers, shape, arrays, owner, local)
         if not dr.any(at_plane):
-            return records, None, least, boxes
+            return ViewRecords(records, None, least, boxes)
         index = dr.compress(at_plane)
         plane_records, row = self._plane_records(index, owner, local), index * RECORD
         number = mi.Float(dr.arange(mi.UInt32, dr.width(index)))
         dr.scatter(records, number, row + GaussianRecord.place("u0"))
         dr.scatter(records, mi.Float(-1.0), row + GaussianRecord.place("a"))
         dr.eval(records)
-        return records, plane_records, least, boxes
+        return ViewRecords(records, plane_records, least, boxes)
 
     def _record(self, g: _Input, bounds: _Bounds, local: mi.UInt32) -> GaussianRecord:
         """Return view records of Gaussians that do not reach the camera's plane."""

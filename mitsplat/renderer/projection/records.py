@@ -115,6 +115,22 @@ RECORD = len(GaussianRecord._fields)
 """Floats of a :class:`GaussianRecord`, and of a :class:`PlaneRecord`."""
 
 
+class ViewRecords(NamedTuple):
+    """Gaussians projected to a view.
+
+    Attributes:
+        rows: One :class:`GaussianRecord` per Gaussian, flat.
+        plane_rows: One :class:`PlaneRecord` per Gaussian that reaches the camera's plane, flat; None if there are none.
+        least: Depth [m] in front of which the peak of a Gaussian cannot lie.
+        tile_boxes: Half-open box of tiles (x0, x1, y0, y1) of each Gaussian, flat; empty boxes of invisible Gaussians.
+    """
+
+    rows: mi.Float
+    plane_rows: mi.Float | None
+    least: mi.Float
+    tile_boxes: mi.UInt32
+
+
 class Geometry:
     """Columns of the geometry of a cloud, one row per Gaussian."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from mitsplat.errors import MissingResourceError
 from mitsplat.quality import Quality
 from mitsplat.renderer.projection.gaussian import conic_touches_rectangle, ellipse_spans
-from mitsplat.renderer.projection.records import GaussianRecord
+from mitsplat.renderer.projection.records import GaussianRecord, ViewRecords
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.tile_subset import TileBox, TileSubset
 from mitsplat.renderer.splatting.tile_depths import DEPTH_BITS, depths_by_tile, level_of
@@ -60,23 +60,18 @@ class Pairs:
 
 
 def pair_records(
-    records: mi.Float,
-    plane_records: mi.Float | None,
-    least: mi.Float,
-    box: mi.UInt32,
+    records: ViewRecords,
     view: CameraView,
     quality: Quality,
     subset: TileSubset | TileBox | None,
+    *,
     numbered: bool,
     groups: mi.UInt32 | None = None,
 ) -> Pairs | None:
     """Pair every record with the tiles that it intersects; return None if there are no pairs.
 
     Args:
-        records: View records, flat.
-        plane_records: Records of the Gaussians that reach the camera's plane; None if there are none.
-        least: Depth [m] in front of which the peak of a record cannot lie.
-        box: Half-open boxes of tiles (x0, x1, y0, y1) of the records, flat.
+        records: Gaussians projected to the view.
         view: The camera.
         quality: Cut-off of the opacity.
         subset: Tiles that have lists, which are then given by their places in the subset; None for all tiles.
@@ -86,18 +81,18 @@ def pair_records(
     Raises:
         CrowdedError: If there are more than :data:`PAIRS_MAX` pairs, or more tiles or records than sort keys can hold.
     """
-    count = dr.width(least)
+    count = dr.width(records.least)
     if count > 1 << NUMBER_BITS or view.tiles_x * view.tiles_y > TILES_MAX:
         raise CrowdedError
     # Rows first: one lane finds the spans of one record, then one lane fills one span.
-    spans = _spans_of_rows(records, count, box, view, quality, subset)
+    spans = _spans_of_rows(records, count, view, quality, subset)
     if spans is None:
         return None
     pair_of, pairs = prefix_ranges(spans.length, view.tiles_x)
     if pairs == 0:
         return None
-    record = GaussianRecord.fetch(records, spans.owner)
-    ellipsoid = dr.gather(mi.Float, least, spans.owner)
+    record = GaussianRecord.fetch(records.rows, spans.owner)
+    ellipsoid = dr.gather(mi.Float, records.least, spans.owner)
     key, number = dr.empty(mi.UInt64, pairs), dr.empty(mi.UInt32, pairs) if numbered else None
 
     def in_view(tile: mi.UInt32, active: mi.Bool = True) -> mi.UInt32:
@@ -105,7 +100,7 @@ def pair_records(
 
     if groups is None:
         first_in_view = in_view(spans.first_tile, spans.length > 0)
-        depth_of = depths_by_tile(record, plane_records, ellipsoid, first_in_view, view, quality)
+        depth_of = depths_by_tile(record, records.plane_rows, ellipsoid, first_in_view, view, quality)
     else:
         group = dr.gather(mi.UInt32, groups, spans.owner)
 
@@ -150,22 +145,21 @@ class _Spans:
 
 
 def _spans_of_rows(
-    records: mi.Float,
+    records: ViewRecords,
     count: int,
-    box: mi.UInt32,
     view: CameraView,
     quality: Quality,
     subset: TileSubset | TileBox | None,
 ) -> _Spans | None:
     """Find the spans of ``count`` records in every row of their tile boxes; return None if there are no rows."""
     order = dr.arange(mi.UInt32, count)
-    x0, x1, y0, y1 = dr.gather(mi.Array4u, box, order)
+    x0, x1, y0, y1 = dr.gather(mi.Array4u, records.tile_boxes, order)
     first_row, rows = prefix_ranges(dr.select(y1 > y0, y1 - y0, 0), view.tiles_y)
     if rows == 0:
         return None
     cut = dr.log2(dr.opaque(mi.Float, quality.alpha_min))
     owner, first_tile, length = (dr.empty(mi.UInt32, rows) for _ in range(3))
-    span_of = _span_function(GaussianRecord.fetch(records, order), cut, x0, x1, view)
+    span_of = _span_function(GaussianRecord.fetch(records.rows, order), cut, x0, x1, view)
 
     def one_row(y: mi.UInt32) -> tuple[mi.UInt32]:
         lo, hi = span_of(y)

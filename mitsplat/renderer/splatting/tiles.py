@@ -19,7 +19,7 @@ import mitsuba as mi
 from mitsplat.quality import Quality
 from mitsplat.renderer.projection.clouds import CloudSet, Placement, placement_table
 from mitsplat.renderer.projection.projector import Projector
-from mitsplat.renderer.projection.records import RECORD, GaussianRecord
+from mitsplat.renderer.projection.records import RECORD, GaussianRecord, ViewRecords
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import concatenated
 from mitsplat.renderer.rays.tile_subset import TileBox, TileSubset
@@ -102,7 +102,7 @@ def bin_gaussians(
     source = Projector(clouds, table, view, quality, at_camera, changed)
 
     if subset is None and not (fitted or for_gradients) and _skips_culling(dr.width(local)):
-        records, plane_records, least, box = source.records_unculled(owner, local)
+        records = source.records_unculled(owner, local)
     else:
         visible, at_plane = source.cull(owner, local, subset)
         index = dr.compress(visible)
@@ -111,16 +111,14 @@ def bin_gaussians(
         owner, local = dr.gather(mi.UInt32, owner, index), dr.gather(mi.UInt32, local, index)
         at_plane = dr.gather(mi.Bool, at_plane, index)
         dr.eval(owner, local, at_plane)
-        records, plane_records, least, box = source.records(owner, local, at_plane)
+        records = source.records(owner, local, at_plane)
     ids = {placement.instance for placement in placements}
     only = ids.pop() if len(ids) == 1 else None
-    listed: TileSubset | TileBox | None = TileBox.around(box, view) if fitted else subset
+    listed: TileSubset | TileBox | None = TileBox.around(records.tile_boxes, view) if fitted else subset
     if groups is not None:
-        place = dr.arange(mi.UInt32, dr.width(least)) * RECORD + GaussianRecord.place("instance")
-        groups = dr.gather(mi.UInt32, groups, mi.UInt32(dr.gather(mi.Float, records, place)))
-    return bin_records(
-        records, plane_records, least, box, view, quality, only, listed, groups=groups, for_gradients=for_gradients
-    )
+        place = dr.arange(mi.UInt32, dr.width(records.least)) * RECORD + GaussianRecord.place("instance")
+        groups = dr.gather(mi.UInt32, groups, mi.UInt32(dr.gather(mi.Float, records.rows, place)))
+    return bin_records(records, view, quality, only, listed, groups=groups, for_gradients=for_gradients)
 
 
 def _skips_culling(count: int) -> bool:
@@ -132,10 +130,7 @@ def _skips_culling(count: int) -> bool:
 
 
 def bin_records(
-    records: mi.Float,
-    plane_records: mi.Float | None,
-    least: mi.Float,
-    box: mi.UInt32,
+    records: ViewRecords,
     view: CameraView,
     quality: Quality,
     only: int | None,
@@ -147,10 +142,7 @@ def bin_records(
     """Build tile lists from view records.
 
     Args:
-        records: View records, flat.
-        plane_records: Records of the Gaussians that reach the camera's plane; None if there are none.
-        least: Depth [m] in front of which the peak of a record cannot lie.
-        box: Half-open boxes of tiles (x0, x1, y0, y1) of the records, flat.
+        records: Gaussians projected to the view.
         view: The camera.
         quality: Order and cut-off.
         only: Instance id of all records; None if there are several.
@@ -161,11 +153,13 @@ def bin_records(
     Raises:
         CrowdedError: If there are too many pairs.
     """
-    pairs = pair_records(dr.detach(records), plane_records, least, box, view, quality, subset, for_gradients, groups)
+    detached = records._replace(rows=dr.detach(records.rows))
+    pairs = pair_records(detached, view, quality, subset, numbered=for_gradients, groups=groups)
     if pairs is None:
-        return _empty(view, subset, records)
+        return _empty(view, subset, records.rows)
     tiles, own = _tile_numbers(view, subset)
-    return _sorted_lists(records, plane_records, pairs, least, dr.width(least), tiles, view, only, own)
+    rows, plane_rows, least, _ = records
+    return _sorted_lists(rows, plane_rows, pairs, least, dr.width(least), tiles, view, only, own)
 
 
 def _sorted_lists(

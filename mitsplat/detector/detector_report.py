@@ -14,7 +14,7 @@ from mitsplat.detector.losses import ERROR_KINDS
 from mitsplat.detector.scores import CONFIDENCE, IOU, MAX_DETECTIONS, AveragePrecision, Confusion, Detection
 from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.overlay import class_colour
-from mitsplat.pages.html import inline_image, make_page, mask_path
+from mitsplat.pages.html import inline_image, make_charts, make_page, make_section, make_table, mask_path
 from mitsplat.pages.svg_charts import bars, curves
 from mitsplat.storage.files import JsonObject
 
@@ -46,10 +46,6 @@ def make_report(
     return make_page(title, "\n".join(parts))
 
 
-def _section(key: str, heading: str, body: str) -> str:
-    return f'<section aria-labelledby="{key}"><h2 id="{key}">{heading}</h2>{body}</section>'
-
-
 def _summary(
     found: LabelledSet, scores: Mapping[str, AveragePrecision], confusion: Confusion, results: JsonObject
 ) -> str:
@@ -66,14 +62,13 @@ def _summary(
         "Versions": ", ".join(f"{name} {version}" for name, version in results.get("versions", {}).items())
         or "unknown",
     }
-    lines = "".join(f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items())
     rules = results["rules"]
     note = (
         "Average precision by COCO's rules: mean over 101 recalls and IoU thresholds 0.5 to 0.95, at most "
         f"{MAX_DETECTIONS} detections per image with scores of at least {rules['least_score']}, "
         f"non-maximum suppression at an IoU of {rules['nms_iou']}."
     )
-    return _section("summary", "Summary", f"<table>{lines}</table><p>{note}</p>")
+    return make_section("summary", "Summary", f"{make_table(rows.items())}<p>{note}</p>")
 
 
 def _classes(scores: Mapping[str, AveragePrecision], results: JsonObject) -> str:
@@ -85,7 +80,7 @@ def _classes(scores: Mapping[str, AveragePrecision], results: JsonObject) -> str
         rows.append(f'<tr><th scope="row">{html.escape(name)}</th><td>{count}</td>{cells}</tr>')
     head = "".join(f'<th scope="col">{text}</th>' for text in ("Class", "Labelled", *heads))
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    return _section("classes", "Classes", table)
+    return make_section("classes", "Classes", table)
 
 
 def _charts(scores: Mapping[str, AveragePrecision]) -> str:
@@ -105,13 +100,13 @@ def _charts(scores: Mapping[str, AveragePrecision]) -> str:
         means.append(
             bars(f"AP50-95 of {_PLURALS[kind]} by class", {name: ap for name, (ap, _) in score.classes.items()})
         )
-    return _section("charts", "Charts", f'<div class="charts">{"".join(charts + means)}</div>')
+    return make_section("charts", "Charts", make_charts(charts + means))
 
 
 def _gains(found: Mapping[str, float]) -> str:
     text = "Gain in mAP50-95 of boxes if one kind of error is corrected; gains do not add up."
     chart = bars(text, {ERROR_KINDS[kind]: max(gain, 0.0) for kind, gain in found.items()}, name_width=170)
-    return _section("gains", "Cost of errors", f'<div class="charts">{chart}</div>')
+    return make_section("gains", "Cost of errors", make_charts([chart]))
 
 
 def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
@@ -128,7 +123,7 @@ def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
         rows.append(f'<tr><th scope="row">{name}</th>{"".join(cells)}</tr>')
     text = f"Labelled and detected classes, for scores of at least {CONFIDENCE} and a box IoU of at least {IOU}."
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    return _section("confusion", "Confusion", f'<p>{text}</p><div class="matrix">{table}</div>')
+    return make_section("confusion", "Confusion", f'<p>{text}</p><div class="matrix">{table}</div>')
 
 
 def _worst(found: LabelledSet, truth: JsonObject, detections: Sequence[Detection], confusion: Confusion) -> str:
@@ -153,7 +148,7 @@ def _worst(found: LabelledSet, truth: JsonObject, detections: Sequence[Detection
         )
     text = f"Left: labels. Right: detections with a score of at least {CONFIDENCE}."
     body = "".join(figures) if figures else "<p>All detections are correct.</p>"
-    return _section("worst", "Worst images", f'<p>{text}</p><div class="show-mask show-box show-name">{body}</div>')
+    return make_section("worst", "Worst images", f'<p>{text}</p><div class="show-mask show-box show-name">{body}</div>')
 
 
 def worst_images(confusion: Confusion) -> list[int]:

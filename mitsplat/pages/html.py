@@ -42,6 +42,17 @@ def make_section(key: str, title: str, body: str) -> str:
     return f'<section aria-labelledby="{key}"><h2 id="{key}">{title}</h2>{body}</section>'
 
 
+def make_table(rows: Iterable[tuple[str, str]]) -> str:
+    """Build a table with a name and a value in each row."""
+    cells = (f'<th scope="row">{html.escape(name)}</th><td>{html.escape(value)}</td>' for name, value in rows)
+    return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+
+
+def make_charts(charts: Iterable[str]) -> str:
+    """Build a grid of the charts of :mod:`mitsplat.pages.svg_charts`."""
+    return f'<div class="charts">{"".join(charts)}</div>'
+
+
 def make_figure(alt: str, caption: str, source: str) -> str:
     """Build a picture with a caption; ``source`` is a data URL."""
     return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
@@ -87,10 +98,7 @@ def figure_of(value: float | None, form: str) -> str | None:
 def verdict_of(wrong: Sequence[str], good: str, rows: Mapping[str, str | None]) -> str:
     """Build HTML with one paragraph per defect, or the sentence ``good``, and a table of the known values."""
     lines = "".join(f'<p class="bad">{html.escape(line)}</p>' for line in wrong) or f'<p class="good">{good}</p>'
-    table = "".join(
-        f'<tr><th scope="row">{key}</th><td>{html.escape(value)}</td></tr>' for key, value in rows.items() if value
-    )
-    return f"{lines}<table>{table}</table>"
+    return lines + make_table((key, value) for key, value in rows.items() if value)
 
 
 _PAGE = """<!doctype html>

@@ -9,6 +9,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from mitsplat.pages.html import make_table
+
 _WIDTH, _HEIGHT = 420, 190
 _LEFT, _BOTTOM, _TOP = 46, 34, 10
 
@@ -201,10 +203,7 @@ def _svg(caption: str, height: float, marks: Sequence[str]) -> str:
 
 
 def _figure(caption: str, drawing: str, numbers: Sequence[tuple[str, str]]) -> str:
-    rows = "".join(
-        f'<tr><th scope="row">{html.escape(name)}</th><td>{html.escape(value)}</td></tr>' for name, value in numbers
-    )
-    table = f"<details><summary>Numbers</summary><table>{rows}</table></details>" if rows else ""
+    table = f"<details><summary>Numbers</summary>{make_table(numbers)}</details>" if numbers else ""
     return f"<figure><figcaption>{html.escape(caption)}</figcaption>{drawing}{table}</figure>"
 
 

@@ -14,6 +14,7 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.pages.html import (
     colour_bytes,
     figure_of,
+    make_charts,
     make_figure,
     make_section,
     shrunk_image,
@@ -136,7 +137,7 @@ def _cameras(capture: Capture) -> str:
     if capture.up == "z":
         figures.append(_directions(capture))
     counts = f"<p>{len(capture.photos)} cameras, {len(capture.points)} points.</p>"
-    return make_section("cameras", "Cameras", f'{counts}<div class="charts">{"".join(figures)}</div>')
+    return make_section("cameras", "Cameras", counts + make_charts(figures))
 
 
 def _directions(capture: Capture) -> str:

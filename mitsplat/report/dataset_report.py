@@ -24,9 +24,9 @@ from mitsplat.images.masks import Silhouette
 from mitsplat.images.picture_files import read_picture_inside
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour
-from mitsplat.pages.html import make_page, mask_path, shrunk_image
+from mitsplat.pages.html import make_charts, make_page, make_section, make_table, mask_path, shrunk_image
 from mitsplat.pages.svg_charts import HeatMap, Histogram, bars, columns
-from mitsplat.report.variety import Variety, make_table
+from mitsplat.report.variety import Variety
 from mitsplat.storage.files import JsonObject, Record, open_regular, parse_json, write_text
 
 SAMPLES = 12
@@ -133,7 +133,7 @@ def _summary(content: JsonObject, statistics: _Statistics, audit: Audit, root: P
         "Device": content.get("device", "cpu"),
         "mitsplat": content["mitsplat"],
     }
-    return f'<section aria-labelledby="summary"><h2 id="summary">Summary</h2>{make_table(rows.items())}</section>'
+    return make_section("summary", "Summary", make_table(rows.items()))
 
 
 def _left_out(statistics: _Statistics) -> str:
@@ -159,13 +159,14 @@ def _audit(audit: Audit) -> str:
         f"<li><code>{html.escape(file)}</code>: {html.escape(text)}</li>" for file, text in audit.violations[:100]
     )
     more = f"<p>and {len(audit.violations) - 100} more</p>" if len(audit.violations) > 100 else ""
-    return (
-        f'<section aria-labelledby="audit"><h2 id="audit">Audit</h2>'
+    return make_section(
+        "audit",
+        "Audit",
         f'<p class="{"good" if not audit.violations else "bad"}">{verdict} in {audit.files} files, '
         f"{audit.instances} instances.</p>"
         f"<p>Masks of more than {POLYGON_AREA} px in several parts whose YOLO polygon has an IoU below {POLYGON_IOU}, "
         f"because bridges join the parts: {audit.low_polygons}.</p>"
-        f"{f'<ul>{found}</ul>' if found else ''}{more}</section>"
+        f"{f'<ul>{found}</ul>' if found else ''}{more}",
     )
 
 
@@ -175,10 +176,11 @@ def _samples(root: Path, records: Iterable[Record]) -> str:
         for key, text in _OVERLAYS.items()
     )
     figures = "".join(_sample(root, record) for record in records)
-    return (
-        f'<section aria-labelledby="samples"><h2 id="samples">Samples</h2>'
+    return make_section(
+        "samples",
+        "Samples",
         f"<fieldset><legend>Show</legend>{boxes}</fieldset>"
-        f'<div class="samples {" ".join(f"show-{key}" for key in _SHOWN_FIRST)}" id="sheet">{figures}</div></section>'
+        f'<div class="samples {" ".join(f"show-{key}" for key in _SHOWN_FIRST)}" id="sheet">{figures}</div>',
     )
 
 
@@ -257,18 +259,16 @@ def _charts(statistics: _Statistics, brightness: tuple[np.ndarray, Histogram], s
         brightness[1].draw("Brightness of images", "mean luma"),
         bars("Seconds per frame by stage, median", seconds, unit=" s"),
     ]
-    return (
-        f'<section aria-labelledby="charts"><h2 id="charts">Statistics</h2>'
-        f'<div class="charts">{"".join(charts)}</div></section>'
-    )
+    return make_section("charts", "Statistics", make_charts(charts))
 
 
 def _details(content: JsonObject) -> str:
     scene = html.escape(json.dumps(content["scene"], indent=1))
-    return (
-        f'<section aria-labelledby="origin"><h2 id="origin">Origin</h2>'
+    return make_section(
+        "origin",
+        "Origin",
         f"<details><summary>Libraries</summary>{make_table(content['libraries'].items())}</details>"
-        f'<details><summary>Effective scene</summary><pre tabindex="0">{scene}</pre></details></section>'
+        f'<details><summary>Effective scene</summary><pre tabindex="0">{scene}</pre></details>',
     )
 
 

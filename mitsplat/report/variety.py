@@ -6,12 +6,13 @@ import html
 import math
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from pycocotools import mask as coco_mask
 
 from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.pages.html import make_charts, make_section, make_table
 from mitsplat.pages.svg_charts import Histogram, bars, discs
 from mitsplat.storage.files import JsonObject, Record
 
@@ -176,12 +177,9 @@ class Variety:
                 fixed.append((name, next(iter(texts))))
             else:
                 drawn.append(bars(name, dict(texts.most_common(_MAX_PAIRS))))
-        return (
-            '<section aria-labelledby="variety"><h2 id="variety">Variety</h2>'
-            f'{warned}<div class="charts">{"".join(charts)}</div></section>'
-            '<section aria-labelledby="draws"><h2 id="draws">Draws</h2>'
-            f'<div class="charts">{"".join(drawn)}</div>'
-            f"<details><summary>Constant in all images</summary>{make_table(fixed)}</details></section>"
+        constant = f"<details><summary>Constant in all images</summary>{make_table(fixed)}</details>"
+        return make_section("variety", "Variety", warned + make_charts(charts)) + make_section(
+            "draws", "Draws", make_charts(drawn) + constant
         )
 
 
@@ -199,12 +197,6 @@ class _Sample:
                 del self.values[1::2]
                 self._step *= 2
         self._count += 1
-
-
-def make_table(rows: Iterable[tuple[str, str]]) -> str:
-    """Return an HTML table of a name and a value in each row."""
-    cells = (f'<th scope="row">{html.escape(name)}</th><td>{html.escape(value)}</td>' for name, value in rows)
-    return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
 
 def cell_of(direction: Float64Array) -> tuple[int, int]:

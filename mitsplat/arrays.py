@@ -1,4 +1,4 @@
-"""Aliases of NumPy array types for annotations; shapes and units are stated in docstrings.
+"""Aliases of NumPy array types for annotations, and evenly spaced indices; docstrings state shapes and units.
 
 Device arrays are annotated with Mitsuba's names, such as ``mi.Float`` and ``mi.Color3f``. These types exist once per
 variant. Annotations are never evaluated, and mypy reads such names as ``Any``.
@@ -24,3 +24,9 @@ FloatingArray = npt.NDArray[np.floating[Any]]
 """Array of floats of any size."""
 IntegerArray = npt.NDArray[np.integer[Any]]
 """Array of integers of any size."""
+
+
+def evenly_spaced(total: int, count: int) -> list[int]:
+    """Return at most ``count`` ascending indices below ``total`` at equal intervals, from the first to the last."""
+    places: list[int] = np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int)).tolist()
+    return places

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mitsplat.arrays import ByteImage
+from mitsplat.arrays import ByteImage, evenly_spaced
 from mitsplat.formats.coco import image_file
 from mitsplat.images.picture_files import read_picture_inside
 from mitsplat.labels.labels import Labels
@@ -20,17 +20,12 @@ _CAPTION = 24
 _GAP = 6
 
 
-def spread(total: int, count: int) -> set[int]:
-    """Return up to ``count`` positions, evenly spread over ``range(total)``."""
-    return {round(float(place)) for place in np.linspace(0, total - 1, min(count, total))}
-
-
 class ContactSheet:
     """Picture of up to :data:`_TILES` labelled frames, evenly spread over the ``total`` frames of the dataset."""
 
     def __init__(self, root: Path, total: int) -> None:
         self._root = root
-        self._selected = spread(total, _TILES)
+        self._selected = set(evenly_spaced(total, _TILES))
         self._count = 0
         self._tiles: list[ByteImage] = []
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import Float64Array, evenly_spaced
 from mitsplat.dataset.dataset_files import MANIFEST
 from mitsplat.engine.resources import unused_memory
 from mitsplat.errors import InputError, MissingResourceError
@@ -396,8 +396,7 @@ def _backdrop_warnings(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Fin
 
 def _plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:
     """Plan up to :data:`VIEWS` of the frames, evenly spread."""
-    positions = {round(share * (len(frames) - 1)) for share in np.linspace(0, 1, min(len(frames), VIEWS))}
-    return [plan_frame(scene, frames[position]) for position in sorted(positions)]
+    return [plan_frame(scene, frames[position]) for position in evenly_spaced(len(frames), VIEWS)]
 
 
 def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from pycocotools import mask as coco_mask
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from mitsplat.arrays import evenly_spaced
 from mitsplat.dataset.manifest import LONGEST_LINE, parse_line, read_lines
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
@@ -293,8 +294,7 @@ class Records:
 
     def sample(self, count: int) -> Iterator[Record]:
         """Iterate over up to ``count`` evenly spread records; unreadable lines among them are skipped."""
-        positions = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
-        yield from self._read(self._order[positions])
+        yield from self._read(self._order[evenly_spaced(len(self), count)])
 
     def of_frame(self, index: int) -> Iterator[Record]:
         """Iterate over the readable records of one frame index."""

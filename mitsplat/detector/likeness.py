@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from mitsplat.arrays import BoolArray, ByteImage, Float64Array
+from mitsplat.arrays import BoolArray, ByteImage, Float64Array, evenly_spaced
 from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, Sample, Split, reorder_classes
 from mitsplat.detector.labelled_sets.pictures import read_upright
 from mitsplat.detector.labelled_sets.set_reading import read_set
@@ -168,8 +168,9 @@ def compare_with_photographs(
     sets = [reorder_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
     if not sets:
         raise InputError("there are no rendered images to compare")
-    ours = _sample_evenly([sample for one in sets for sample in one.samples], max_images)
-    theirs = _sample_evenly(list(real.samples), max_images)
+    rendered_samples = [sample for one in sets for sample in one.samples]
+    ours = [rendered_samples[i] for i in evenly_spaced(len(rendered_samples), max_images)]
+    theirs = [real.samples[i] for i in evenly_spaced(len(real.samples), max_images)]
     sides: tuple[_Values, _Values] = defaultdict(list), defaultdict(list)
     hues: tuple[_HueSums, _HueSums] = defaultdict(_zero_hue_sums), defaultdict(_zero_hue_sums)
     for number, sample in enumerate(ours + theirs):
@@ -240,11 +241,6 @@ def _size_ratios(sides: tuple[_Values, _Values], classes: int) -> list[float]:
             upper = [np.quantile([value for _, value in values], 0.75) for values in (ours, theirs)]
             ratios.append(float(upper[0] / upper[1]))
     return ratios
-
-
-def _sample_evenly(samples: list[Sample], max_images: int) -> list[Sample]:
-    places = np.unique(np.linspace(0, len(samples) - 1, min(max_images, len(samples))).round().astype(int))
-    return [samples[place] for place in places]
 
 
 def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _HueSums) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from scipy.ndimage import binary_erosion
 
-from mitsplat.arrays import BoolArray, Float32Array
+from mitsplat.arrays import BoolArray, Float32Array, evenly_spaced
 from mitsplat.capture.capture import Capture, Photo, known_where
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.gaussians.splat_cloud import Splats
@@ -294,7 +294,7 @@ def iou(one: BoolArray, other: BoolArray) -> float:
 
 def take_evenly(items: Sequence[T], count: int) -> list[T]:
     """Return at most ``count`` of the items, at equal intervals."""
-    return [items[int(i)] for i in np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round())]
+    return [items[i] for i in evenly_spaced(len(items), count)]
 
 
 def _inside(mask: BoolArray) -> BoolArray:

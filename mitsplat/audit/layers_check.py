@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
-from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.arrays import AnyArray, BoolArray, Float64Array
 from mitsplat.audit.conveyor_motion import BeltMotion
 from mitsplat.audit.dataset_check import DatasetCheck, Violations
 from mitsplat.audit.decoded_frame import DecodedFrame
@@ -84,44 +84,14 @@ class LayersCheck(DatasetCheck):
         if flow is None or flow.shape[:2] != depth.shape:
             yield file, "cannot be read as optical flow of the frame's size"
             return
-        height, width = depth.shape
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-        slopes = np.column_stack([before.ray_slopes(pixels), np.ones(len(pixels))])
-        known = depth.ravel() > step
-        found = flow.reshape(-1, 2)
-        stated: BoolArray = np.asarray((np.abs(found) < _MAX_FLOW).all(axis=1))
-
-        def wrong_if_moved(motion: Float64Array, chosen: BoolArray) -> BoolArray:
-            """Return a mask of the chosen pixels whose flow differs from that of points with a motion in the world."""
-            turn = frame.camera_from_world @ motion @ before.world_from_camera
-            start, z = pixels[chosen], depth.ravel()[chosen]
-
-            def moved(z: Float64Array) -> Float64Array:
-                return slopes[chosen] * z[:, None] @ turn[:3, :3].T + turn[:3, 3]
-
-            def project(points: Float64Array) -> Float64Array:
-                return frame.project(np.where(points[:, 2:] <= 0, (0, 0, 1), points))
-
-            end = moved(z)
-            near, far = project(moved(z - step / 2)), project(moved(z + step / 2))
-            expected = project(end) - start
-            tolerance = _FLOW_TOLERANCE + np.abs(far - near).max(axis=1) + 1e-5 * np.abs(expected).max(axis=1)
-            in_front = end[:, 2] > frame.record["camera"]["near"] + step
-            is_stated = stated[chosen]
-            differs = np.abs(found[chosen] - expected).max(axis=1) > tolerance
-            wrong: BoolArray = in_front & (~is_stated | differs)
-            unknown = np.flatnonzero(wrong & ~is_stated)
-            wrong[unknown[frame.has_no_pixel(end[unknown])]] = False
-            return wrong
-
+        check = _FlowCheck(before, frame, depth, step, flow)
         motions = list(self._motions(before, frame))
-        wrong, rest = np.zeros(len(known), dtype=bool), known.copy()
+        wrong, rest = np.zeros(depth.size, dtype=bool), check.known.copy()
         for seen, motion in motions:
-            chosen = known & seen.ravel()
+            chosen = check.known & seen.ravel()
             rest &= ~chosen
             if motion is not None and chosen.any():
-                wrong[chosen] = wrong_if_moved(motion, chosen)
+                wrong[chosen] = check.contradicts(motion, chosen)
         # Pixels without a labelled instance may show static parts, a belt, or fragments of instances that move.
         run = np.eye(4)
         run[:3, 3] = self._belt.between(before, frame)
@@ -129,7 +99,7 @@ class LayersCheck(DatasetCheck):
         for motion in (np.eye(4), run, *(motion for _, motion in motions if motion is not None)):
             left = wrong & rest
             if left.any():
-                wrong[left] = wrong_if_moved(motion, left)
+                wrong[left] = check.contradicts(motion, left)
         if count := np.count_nonzero(wrong):
             yield file, f"{count} pixels have a flow that contradicts depth and cameras"
 
@@ -153,6 +123,59 @@ class LayersCheck(DatasetCheck):
                 if self._belt.carries(instance.pose) == carried:
                     seen |= before.full_mask(instance)
             yield seen, motion
+
+
+class _FlowCheck:
+    """Comparison of optical flow with the projected motion of the pixels' points.
+
+    Args:
+        before: Frame of the flow.
+        after: Frame to which the flow leads.
+        depth: Depth of ``before`` [m], shape (H, W).
+        step: Quantisation step of the depth [m].
+        flow: Stored flow [px], shape (H, W, 2).
+
+    Attributes:
+        known: Mask of the pixels with a depth, row by row, shape (H * W,).
+    """
+
+    def __init__(
+        self, before: DecodedFrame, after: DecodedFrame, depth: Float64Array, step: float, flow: AnyArray
+    ) -> None:
+        height, width = depth.shape
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        self._before, self._after, self._depth, self._step = before, after, depth.ravel(), step
+        self._pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+        self._rays = np.column_stack([before.ray_slopes(self._pixels), np.ones(len(self._pixels))])
+        self._flow = flow.reshape(-1, 2)
+        self._is_stated: BoolArray = np.asarray((np.abs(self._flow) < _MAX_FLOW).all(axis=1))
+        self.known: BoolArray = self._depth > step
+
+    def contradicts(self, motion: Float64Array, chosen: BoolArray) -> BoolArray:
+        """Return a mask of the chosen pixels (H * W,) whose flow differs from that of points with a motion (4, 4).
+
+        The points move in the world. A flow may be absent where the lens of the next camera has no ray.
+        """
+        turn = self._after.camera_from_world @ motion @ self._before.world_from_camera
+        start, z, half = self._pixels[chosen], self._depth[chosen], self._step / 2
+
+        def moved(z: Float64Array) -> Float64Array:
+            return self._rays[chosen] * z[:, None] @ turn[:3, :3].T + turn[:3, 3]
+
+        def project(points: Float64Array) -> Float64Array:
+            return self._after.project(np.where(points[:, 2:] <= 0, (0, 0, 1), points))
+
+        end = moved(z)
+        expected = project(end) - start
+        depth_effect = np.abs(project(moved(z + half)) - project(moved(z - half))).max(axis=1)
+        tolerance = _FLOW_TOLERANCE + depth_effect + 1e-5 * np.abs(expected).max(axis=1)
+        is_stated = self._is_stated[chosen]
+        differs = np.abs(self._flow[chosen] - expected).max(axis=1) > tolerance
+        in_front = end[:, 2] > self._after.record["camera"]["near"] + self._step
+        wrong: BoolArray = in_front & (~is_stated | differs)
+        unknown = np.flatnonzero(wrong & ~is_stated)
+        wrong[unknown[self._after.has_no_pixel(end[unknown])]] = False
+        return wrong
 
 
 def _has_unlabelled_motion(frame: DecodedFrame) -> bool:

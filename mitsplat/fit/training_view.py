@@ -36,14 +36,12 @@ class HeldOut:
         psnr: PSNR of the whole picture [dB], black outside the mask.
         ssim: SSIM of the whole picture.
         psnr_object: PSNR of the masked pixels [dB]; ``psnr`` without mask.
-        psnr_corrected: PSNR of these pixels after the best affine colour correction [dB].
     """
 
     name: str
     psnr: float
     ssim: float
     psnr_object: float
-    psnr_corrected: float
 
 
 class TrainingView:
@@ -175,8 +173,6 @@ class TrainingView:
         if self._hidden is not None:
             seen = np.where(self._hidden[..., None], truth, seen)  # the true colour is unknown there
         shown = cover > 0.5 if (cover > 0.5).any() else np.ones_like(cover, dtype=bool)
-        design = np.column_stack([seen[shown], np.ones(shown.sum())])
-        corrected = np.clip(design @ np.linalg.lstsq(design, truth[shown], rcond=None)[0], 0, 1)
         if folder is not None:
             difference = np.clip(_DIFFERENCE_GAIN * np.abs(seen - truth), 0, 1)
             sheet = np.rint(np.concatenate([truth, seen, difference], axis=1) * 255).astype(np.uint8)
@@ -187,7 +183,6 @@ class TrainingView:
             psnr=psnr(seen, truth),
             ssim=ssim(seen, truth),
             psnr_object=psnr(seen[shown], truth[shown]),
-            psnr_corrected=psnr(corrected, truth[shown]),
         )
 
 

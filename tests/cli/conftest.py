@@ -42,7 +42,7 @@ def write_dataset(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
 
 @pytest.fixture
 def fit_capture(monkeypatch: pytest.MonkeyPatch) -> Calls:
-    seen = HeldOut(name="a.jpg", psnr=28.0, ssim=0.9, psnr_object=25.0, psnr_corrected=26.0)
+    seen = HeldOut(name="a.jpg", psnr=28.0, ssim=0.9, psnr_object=25.0)
     calls = Calls(
         FitResult(box_asset("nut").splats, 70, 3.5, (seen,), "inputs", validation=(replace(seen, psnr=29.0),))
     )

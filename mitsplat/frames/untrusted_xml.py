@@ -95,6 +95,7 @@ class _Reader:
         allow_outside: Accept files outside of the scene's folder.
 
     Attributes:
+        parameters: Values of the parameters that are defined so far.
         names: Files whose reading has started.
         pieces: New text of each file.
     """
@@ -102,7 +103,7 @@ class _Reader:
     def __init__(self, scene: Path, *, allow_outside: bool) -> None:
         self._scene = scene
         self._bounds = None if allow_outside else scene.parent
-        self._parameters: dict[str, str] = {}
+        self.parameters: dict[str, str] = {}
         self._read_budget = self._write_budget = MAX_BYTES
         self.names: list[Path] = []
         self.pieces: list[list[str | _FileName]] = []
@@ -110,7 +111,7 @@ class _Reader:
     def text(self, pieces: Sequence[str | _FileName], folders: Sequence[Path]) -> str:
         """Join text pieces and resolve file names in the given folders."""
         return "".join(
-            piece if isinstance(piece, str) else _quoted(str(self._find(piece.name, folders, piece.place, "string")))
+            piece if isinstance(piece, str) else _quoted(str(self.find(piece.name, folders, piece.place, "string")))
             for piece in pieces
         )
 
@@ -126,72 +127,22 @@ class _Reader:
             Number of the file.
         """
         data = self._read_bytes(path)
-        number, pieces, parents = len(self.names), list[str | _FileName](), list[str]()
+        number = len(self.names)
         self.names.append(path)
-        self.pieces.append(pieces)
-        parser = expat.ParserCreate()
-        line = 1
-
-        def refuse(rule: str) -> InputError:
-            return InputError(f"{path}:{parser.CurrentLineNumber}: {rule}")
-
-        def doctype(name: str, *_: object) -> None:
-            raise refuse(f"must not have a document type (got {name})")
-
-        def write(piece: str | _FileName) -> None:
-            self._write_budget -= len(piece if isinstance(piece, str) else piece.name)
-            if self._write_budget < 0:
-                raise refuse(f"the scene must not be larger than {MAX_BYTES >> 20} MiB with its parameters replaced")
-            pieces.append(piece)
-
-        def start(name: str, given: dict[str, str]) -> None:
-            nonlocal line
-            place = f"{path}:{parser.CurrentLineNumber}"
-            if len(parents) == MAX_DEPTH:
-                raise refuse(f"must not nest deeper than {MAX_DEPTH} elements")
-            if not parents and (name in _RESOLVED or (level == 0 and name != "scene")):
-                raise refuse(f"must begin with <scene> (got <{name}>)")
-            if parents and parents[-1] in _RESOLVED:
-                raise refuse(f"<{parents[-1]}> must hold no elements (got <{name}>)")
-            parents.append(name)
-            values = {key: self._substitute(value, place) for key, value in given.items()}
-            if name in _RESOLVED:
-                _check_attributes(name, values, place)
-            if name == "default":
-                self._parameters.setdefault(values["name"], values["value"])
-            elif name == "path":
-                if len(parents) != 2:
-                    raise refuse("path must be directly in the first element")
-                found = self._find(values["value"], [path.parent, *folders], place, name)
-                if not found.is_dir():
-                    raise refuse(f"path: no such folder (got {values['value']})")
-                folders.insert(0, found)
-            else:
-                if name == "include":
-                    inner = [path.parent, *folders]
-                    found = self._find(values["filename"], inner, place, name)
-                    if not found.is_file():
-                        raise refuse(f"include: no such file (got {values['filename']})")
-                    if level + 1 == _MAX_LEVELS:
-                        raise refuse(f"must not include files on more than {_MAX_LEVELS} levels")
-                    values["filename"] = f"{self.read(found, inner, level + 1)}.xml"
-                write("\n" * (parser.CurrentLineNumber - line) + f"<{name}")
-                line = parser.CurrentLineNumber
-                for key, value in values.items():
-                    write(f" {key}=")
-                    write(self._value(name, key, value, values, folders, place))
-                write(">")
-
-        def end(name: str) -> None:
-            if parents.pop() not in ("default", "path"):
-                write(f"</{name}>")
-
-        parser.StartDoctypeDeclHandler, parser.StartElementHandler, parser.EndElementHandler = doctype, start, end
-        try:
-            parser.Parse(data, True)
-        except expat.ExpatError as error:
-            raise InputError(f"{path}:{error.lineno}: not XML ({expat.errors.messages[error.code]})") from error
+        self.pieces.append([])
+        _FileReader(self, path, folders, level, self.pieces[number]).parse(data)
         return number
+
+    def spend(self, size: int, place: str) -> None:
+        """Count characters of the new text.
+
+        Raises:
+            InputError: If the scene becomes too large.
+        """
+        self._write_budget -= size
+        if self._write_budget < 0:
+            rule = f"the scene must not be larger than {MAX_BYTES >> 20} MiB with its parameters replaced"
+            raise InputError(f"{place}: {rule}")
 
     def _read_bytes(self, path: Path) -> bytes:
         if len(self.names) > MAX_INCLUDES:
@@ -212,12 +163,12 @@ class _Reader:
         self._read_budget -= len(data)
         return data
 
-    def _substitute(self, text: str, place: str) -> str:
+    def substitute(self, text: str, place: str) -> str:
         """Substitute parameters, the longest name first, and unescape dollar signs."""
         if "$" not in text:
             return text
-        for name in sorted(self._parameters, key=len, reverse=True):
-            value = self._parameters[name]
+        for name in sorted(self.parameters, key=len, reverse=True):
+            value = self.parameters[name]
             if len(text) + text.count(f"${name}") * len(value) > MAX_TEXT:
                 raise InputError(
                     f"{place}: text must not be longer than {MAX_TEXT} characters with parameters replaced"
@@ -227,12 +178,12 @@ class _Reader:
             raise InputError(f"{place}: undefined parameter: ${undefined[1]}")
         return text.replace("\\$", "$")
 
-    def _value(
+    def value(
         self, element: str, key: str, value: str, values: Mapping[str, str], folders: Sequence[Path], place: str
     ) -> str | _FileName:
         """Return the quoted form of an attribute's value."""
         if element == "spectrum" and key == "filename":
-            return _quoted(str(self._find(value, folders, place, element)))
+            return _quoted(str(self.find(value, folders, place, element)))
         if element == "string" and key == "value" and value and values.get("name") in _FILE_PROPERTIES:
             return _FileName(value, place)
         if key == "type" and not _PLUGIN.fullmatch(value):
@@ -241,7 +192,7 @@ class _Reader:
             raise InputError(f"{place}: {_INSIDE_RULE} (got {value}); --allow-outside lifts this")
         return _quoted(value)
 
-    def _find(self, name: str, folders: Sequence[Path], place: str, element: str) -> Path:
+    def find(self, name: str, folders: Sequence[Path], place: str, element: str) -> Path:
         """Resolve a name to an absolute path without links.
 
         A name that no search folder contains is resolved in the scene's folder.
@@ -260,6 +211,101 @@ class _Reader:
         except UnicodeEncodeError:
             raise InputError(f"{place}: {element} must have a path in UTF-8 (got {os.fsencode(path)!r})") from None
         return path
+
+
+class _FileReader:
+    """Reader of one file of a scene.
+
+    Args:
+        reader: Reader of the scene.
+        path: The file.
+        folders: Search folders; the file's ``<path>`` elements extend the list.
+        level: Inclusion depth of the file.
+        pieces: New text of the file, which is extended.
+    """
+
+    def __init__(
+        self, reader: _Reader, path: Path, folders: list[Path], level: int, pieces: list[str | _FileName]
+    ) -> None:
+        self._reader, self._path, self._folders, self._level, self._pieces = reader, path, folders, level, pieces
+        self._parents: list[str] = []
+        self._line = 1
+        self._parser = expat.ParserCreate()
+        self._parser.StartDoctypeDeclHandler = self._refuse_doctype
+        self._parser.StartElementHandler, self._parser.EndElementHandler = self._start, self._end
+
+    def parse(self, data: bytes) -> None:
+        """Rewrite the content of the file.
+
+        Raises:
+            InputError: With file, line, rule and value.
+        """
+        try:
+            self._parser.Parse(data, True)
+        except expat.ExpatError as error:
+            rule = f"not XML ({expat.errors.messages[error.code]})"
+            raise InputError(f"{self._path}:{error.lineno}: {rule}") from error
+
+    @property
+    def _place(self) -> str:
+        return f"{self._path}:{self._parser.CurrentLineNumber}"
+
+    def _refuse_doctype(self, name: str, *_: object) -> None:
+        raise InputError(f"{self._place}: must not have a document type (got {name})")
+
+    def _write(self, piece: str | _FileName) -> None:
+        self._reader.spend(len(piece if isinstance(piece, str) else piece.name), self._place)
+        self._pieces.append(piece)
+
+    def _start(self, name: str, given: dict[str, str]) -> None:
+        """Handle the start of an element."""
+        place, parents = self._place, self._parents
+        if len(parents) == MAX_DEPTH:
+            raise InputError(f"{place}: must not nest deeper than {MAX_DEPTH} elements")
+        if not parents and (name in _RESOLVED or (self._level == 0 and name != "scene")):
+            raise InputError(f"{place}: must begin with <scene> (got <{name}>)")
+        if parents and parents[-1] in _RESOLVED:
+            raise InputError(f"{place}: <{parents[-1]}> must hold no elements (got <{name}>)")
+        parents.append(name)
+        values = {key: self._reader.substitute(value, place) for key, value in given.items()}
+        if name in _RESOLVED:
+            _check_attributes(name, values, place)
+        if name == "default":
+            self._reader.parameters.setdefault(values["name"], values["value"])
+        elif name == "path":
+            self._add_folder(values["value"])
+        else:
+            if name == "include":
+                values["filename"] = f"{self._include(values['filename'])}.xml"
+            self._write("\n" * (self._parser.CurrentLineNumber - self._line) + f"<{name}")
+            self._line = self._parser.CurrentLineNumber
+            for key, value in values.items():
+                self._write(f" {key}=")
+                self._write(self._reader.value(name, key, value, values, self._folders, place))
+            self._write(">")
+
+    def _add_folder(self, name: str) -> None:
+        """Add the folder of a ``<path>`` element to the search folders."""
+        if len(self._parents) != 2:
+            raise InputError(f"{self._place}: path must be directly in the first element")
+        found = self._reader.find(name, [self._path.parent, *self._folders], self._place, "path")
+        if not found.is_dir():
+            raise InputError(f"{self._place}: path: no such folder (got {name})")
+        self._folders.insert(0, found)
+
+    def _include(self, name: str) -> int:
+        """Read an included file, and return its number."""
+        folders = [self._path.parent, *self._folders]
+        found = self._reader.find(name, folders, self._place, "include")
+        if not found.is_file():
+            raise InputError(f"{self._place}: include: no such file (got {name})")
+        if self._level + 1 == _MAX_LEVELS:
+            raise InputError(f"{self._place}: must not include files on more than {_MAX_LEVELS} levels")
+        return self._reader.read(found, folders, self._level + 1)
+
+    def _end(self, name: str) -> None:
+        if self._parents.pop() not in ("default", "path"):
+            self._write(f"</{name}>")
 
 
 def _exists(path: Path) -> bool:

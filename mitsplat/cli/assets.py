@@ -22,11 +22,14 @@ from mitsplat.cli.options import (
     Name,
     Roughness,
     Seed,
+    given_options,
+    refuse_options,
     uniform_material,
 )
 from mitsplat.errors import InputError
 
 if TYPE_CHECKING:
+    from mitsplat.importing.splat_import import Imported
     from mitsplat.mesh_files.mesh_file import MeshFile
 
 Overwrite = Annotated[
@@ -156,6 +159,7 @@ def bake(
 
 
 def import_(
+    context: typer.Context,
     file: Annotated[
         Path,
         typer.Argument(
@@ -230,11 +234,9 @@ def import_(
 
         stage = read_stage_asset(file)
         if stage.asset is not None:
-            fixed: dict[str, object] = {"--up": up != "auto", "--size": size, "--units": units, "--crop": crop}
-            fixed |= {"--without-table": without_table, "--flat-base": flat_base, "--scene": scene}
-            fixed |= {"--metallic": metallic, "--roughness": roughness}
-            if given := [option for option, value in fixed.items() if value]:
-                raise InputError(f"{given[0]} does not apply to {file}, whose colliders state its geometry")
+            fixed = {"--up", "--size", "--units", "--crop", "--without-table", "--flat-base", "--scene"}
+            fixed |= {"--metallic", "--roughness"}
+            refuse_options(given_options(context) & fixed, f"{file}, whose colliders state its geometry")
             asset = with_values(
                 stage.asset, name, class_name, mass=mass, density=density, friction=friction, light=light
             )
@@ -273,26 +275,29 @@ def import_(
             stage=stage,
             progress=progress,
         )
-    made = result.asset
-    made.save(out)
-    report = write_import_report(out, result)
-    typer.echo(f"up: {result.upright.reason}")
-    typer.echo(f"Gaussians: {result.removed_of_all}")
-    if result.training is not None:
-        typer.echo(f"trained: {result.training}")
-    if made.mesh is not None:
-        extents = " x ".join(f"{extent:.4g}" for extent in made.mesh.extents)
-        pieces = f", {len(made.pieces)} convex pieces" if made.pieces else ""
-        typer.echo(
-            f"extents: {extents} {'m' if made.units == 'metre' else 'units'}; {len(made.mesh.faces)} faces{pieces}"
-        )
-    for miss in result.misses:
-        typer.echo(f"warning: {miss}")
-    typer.echo(f"report: {report}")
+    result.asset.save(out)
+    _print_import(result)
+    typer.echo(f"report: {write_import_report(out, result)}")
     typer.echo(f"asset: {out}")
     if scene is not None:
         write_scene(scene, out, result)
         typer.echo(f"scene: {scene}")
+
+
+def _print_import(result: Imported) -> None:
+    """Print the properties of an imported asset and warnings."""
+    asset = result.asset
+    typer.echo(f"up: {result.upright.reason}")
+    typer.echo(f"Gaussians: {result.removed_of_all}")
+    if result.training is not None:
+        typer.echo(f"trained: {result.training}")
+    if asset.mesh is not None:
+        extents = " x ".join(f"{extent:.4g}" for extent in asset.mesh.extents)
+        pieces = f", {len(asset.pieces)} convex pieces" if asset.pieces else ""
+        unit = "m" if asset.units == "metre" else "units"
+        typer.echo(f"extents: {extents} {unit}; {len(asset.mesh.faces)} faces{pieces}")
+    for miss in result.misses:
+        typer.echo(f"warning: {miss}")
 
 
 def _check_folder(out: Path, source: Path, name: str | None, *, overwrite: bool) -> None:

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import typer
 
@@ -54,7 +54,7 @@ def command_log(
         yield lambda: progress_bar(unit)
         return
 
-    def emit(event: str, **details: Any) -> None:
+    def emit(event: str, **details: object) -> None:
         line = json.dumps({"time": round(time.time(), 3), "command": command, "event": event, **details})
         typer.echo(line, err=True)
 

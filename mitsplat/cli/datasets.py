@@ -5,10 +5,10 @@ Each command imports its dependencies inside its function, so that all other com
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -25,6 +25,8 @@ from mitsplat.cli.options import (
     SceneSeed,
     check_new,
     check_output_file,
+    given_options,
+    refuse_options,
     scene_overrides,
 )
 from mitsplat.errors import InputError, PartialResultError
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
 
 
 def render(
+    context: typer.Context,
     scene: Annotated[
         Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml), OpenUSD stage, or Mitsuba scene (.xml).")
     ],
@@ -124,24 +127,13 @@ def render(
     from mitsplat.runtime.device import find_device
     from mitsplat.usd.usd_layers import is_usd
 
-    values: dict[str, object] = {
-        "--frames": frames,
-        "--only": only,
-        "--size": size,
-        "--seed": seed,
-        "--format": formats,
-    }
-    values |= {"--quality": quality, "--tolerance": tolerance, "--workers": workers, "--shard": shard}
-    values |= {"--address": address, "--resources": resources}
-    flags = {"--any-device": any_device, "--engine": engine != "local", "--overwrite": overwrite}
-    given = {name for name, value in values.items() if value is not None} | {name for name, on in flags.items() if on}
-
+    given = given_options(context) - {"--out", "--device", "--json", "--allow-outside"}
     with command_log(json_log, "render") as progress_bars:
         if only is not None:
             one = given & {"--frames", "--shard", "--engine", "--workers", "--overwrite"}
-            _refuse(one, "--only, which renders one image on this machine")
+            refuse_options(one, "--only, which renders one image on this machine")
         if engine != "ray":
-            _refuse(given & {"--address", "--resources"}, "this machine: add --engine ray for a Ray cluster")
+            refuse_options(given & {"--address", "--resources"}, "this machine: add --engine ray for a Ray cluster")
         overrides = scene_overrides(size=size, seed=seed, quality=quality, formats=formats)
         if out is None:
             out = Path("out") / (scene.stem if shard is None else f"{scene.stem}-{shard.replace('/', '-of-')}")
@@ -149,13 +141,15 @@ def render(
         if chosen is not None and not json_log:
             print_device(chosen)
         if scene.suffix == ".xml":
-            _refuse(given, f"the Mitsuba scene {scene}, which has its own size, seed and quality")
+            refuse_options(given, f"the Mitsuba scene {scene}, which has its own size, seed and quality")
             from mitsplat.frames.mitsuba_xml import render_apart
 
             typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside, device=chosen)}")
             return
         if is_usd(scene):
-            _refuse(given - {"--frames", "--size", "--format", "--quality", "--overwrite"}, f"the USD stage {scene}")
+            refuse_options(
+                given - {"--frames", "--size", "--format", "--quality", "--overwrite"}, f"the USD stage {scene}"
+            )
             _render_stage(scene, out, frames, overrides, device=device or "cpu", overwrite=overwrite)
             return
         from mitsplat.dataset.dataset_folder import Shard
@@ -196,7 +190,7 @@ def render(
 def _fastest_preset(
     scene: Path,
     tolerance: float,
-    overrides: dict[str, Any],
+    overrides: dict[str, object],
     allow_outside: bool,
     device: Device | None,
     progress_bars: Callable[[], AbstractContextManager[Progress]],
@@ -216,14 +210,8 @@ def _fastest_preset(
     return best.name
 
 
-def _refuse(options: set[str], source: str) -> None:
-    """Raise InputError if any option was given that does not apply to the source."""
-    if options:
-        raise InputError(f"{min(options)} does not apply to {source}")
-
-
 def _render_stage(
-    stage: Path, out: Path, times: int | None, overrides: Mapping[str, Any], *, device: str, overwrite: bool
+    stage: Path, out: Path, times: int | None, overrides: Mapping[str, object], *, device: str, overwrite: bool
 ) -> None:
     """Render the cameras of a USD stage at its time codes, at most ``times``, to a labelled dataset."""
     if times is not None and times < 1:
@@ -389,39 +377,46 @@ def export(
     files = out.with_name(f"{out.stem}_files")
     if files.exists() and not overwrite and not (files.is_dir() and not any(files.iterdir())):
         raise InputError(f"--out {out}: the folder {files} must not exist yet; --overwrite replaces its files")
-    is_asset, to_mitsuba = source.is_dir(), out.suffix.lower() == ".xml" and not mjcf
-    losses: tuple[str, ...] = ()
-    if is_asset and to_mitsuba:
-        raise InputError(f"--out of an asset must be a USD stage, .glb, or MJCF with --mjcf (got {out})")
-    if is_asset:
-        from mitsplat.asset import Asset
-
-        asset = Asset.load(source)
-        if to_gltf:
-            from mitsplat.gltf_splats.splat_writing import export_asset_gltf
-
-            losses = export_asset_gltf(asset, out, spz=spz)
-        else:
-            from mitsplat.usd.mjcf import export_asset_mjcf
-            from mitsplat.usd.usd_export import export_asset_usd
-
-            losses = (export_asset_mjcf if mjcf else export_asset_usd)(asset, out)
+    if source.is_dir():
+        losses = _export_asset(source, out, mjcf=mjcf, spz=spz)
     else:
-        from mitsplat.scene.loading.scene_loading import load_scene
-
-        scene = load_scene(source, allow_outside=allow_outside)
-        if to_mitsuba:
-            from mitsplat.frames.mitsuba_xml import export_xml
-
-            export_xml(scene, frame, out)
-        else:
-            from mitsplat.usd.mjcf import export_scene_mjcf
-            from mitsplat.usd.usd_export import export_scene_usd
-
-            losses = (export_scene_mjcf if mjcf else export_scene_usd)(scene, frame, out)
+        losses = _export_scene(source, frame, out, mjcf=mjcf, allow_outside=allow_outside)
     for loss in losses:
         typer.echo(f"not exported: {loss}")
-    typer.echo(f"{'asset' if is_asset else 'scene'}: {out}")
+    typer.echo(f"{'asset' if source.is_dir() else 'scene'}: {out}")
+
+
+def _export_asset(folder: Path, out: Path, *, mjcf: bool, spz: bool) -> Sequence[str]:
+    """Export an asset, and return sentences on what the format cannot hold."""
+    if out.suffix.lower() == ".xml" and not mjcf:
+        raise InputError(f"--out of an asset must be a USD stage, .glb, or MJCF with --mjcf (got {out})")
+    from mitsplat.asset import Asset
+
+    asset = Asset.load(folder)
+    if out.suffix.lower() == ".glb":
+        from mitsplat.gltf_splats.splat_writing import export_asset_gltf
+
+        return export_asset_gltf(asset, out, spz=spz)
+    from mitsplat.usd.mjcf import export_asset_mjcf
+    from mitsplat.usd.usd_export import export_asset_usd
+
+    return (export_asset_mjcf if mjcf else export_asset_usd)(asset, out)
+
+
+def _export_scene(path: Path, frame: int, out: Path, *, mjcf: bool, allow_outside: bool) -> Sequence[str]:
+    """Export a frame of a scene, and return sentences on what the format cannot hold."""
+    from mitsplat.scene.loading.scene_loading import load_scene
+
+    scene = load_scene(path, allow_outside=allow_outside)
+    if out.suffix.lower() == ".xml" and not mjcf:
+        from mitsplat.frames.mitsuba_xml import export_xml
+
+        export_xml(scene, frame, out)
+        return ()
+    from mitsplat.usd.mjcf import export_scene_mjcf
+    from mitsplat.usd.usd_export import export_scene_usd
+
+    return (export_scene_mjcf if mjcf else export_scene_usd)(scene, frame, out)
 
 
 def _print_summary(summary: DatasetSummary, *, whole: bool = True) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -59,6 +59,18 @@ JsonLog = Annotated[
 ]
 
 
+def given_options(context: typer.Context) -> set[str]:
+    """Return the long names of the options of a command whose values differ from their defaults."""
+    options = (one for one in context.command.params if one.param_type_name == "option")
+    return {max(one.opts, key=len) for one in options if context.params.get(one.name or "") != one.default}
+
+
+def refuse_options(options: set[str], source: str) -> None:
+    """Raise InputError if there is an option, because it does not apply to the source."""
+    if options:
+        raise InputError(f"{min(options)} does not apply to {source}")
+
+
 def check_ending(out: Path | None, *endings: str) -> None:
     """Raise InputError if the output file has none of the given endings."""
     if out is not None and out.suffix.lower() not in endings:
@@ -94,13 +106,13 @@ def uniform_material(metallic: float | None, roughness: float | None) -> dict[st
 
 def scene_overrides(
     *, size: str | None = None, seed: int | None = None, quality: str | None = None, formats: str | None = None
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the given options as a mapping from scene file keys to values."""
     from mitsplat.scene.spec.scene_spec import FORMATS  # most commands do not need it
 
     if seed is not None and seed < 0:
         raise InputError(f"--seed must be >= 0 (got {seed})")
-    overrides: dict[str, Any] = {"seed": seed, "quality": quality}
+    overrides: dict[str, object] = {"seed": seed, "quality": quality}
     if size is not None:
         width, _, height = size.lower().partition("x")
         if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):

@@ -128,11 +128,11 @@ class Imported:
         removed: Number of removed Gaussians, by reason.
         removed_splats: Removed Gaussians, in the asset's frame.
         support: Surface of an environment for dropping objects, or None.
+        watertight: True if the mesh encloses a volume.
+        topples: True if the object would fall over in its pose.
         views: Pictures of asset and mesh from views that were not used for the reconstruction.
         mesh_iou: Mean IoU of the silhouettes of mesh and splats in these views, for an object.
         offset: Shift between the mesh and the surface of the splats, as a fraction of the mesh's diagonal.
-        watertight: True if the mesh encloses a volume.
-        topples: True if the object would fall over in its pose.
     """
 
     asset: Asset
@@ -141,11 +141,11 @@ class Imported:
     removed: dict[str, int]
     removed_splats: Splats
     support: ImportSupport | None
-    views: Sequence[AssetView]
-    mesh_iou: float | None
-    offset: float | None
     watertight: bool
     topples: bool
+    views: Sequence[AssetView] = ()
+    mesh_iou: float | None = None
+    offset: float | None = None
 
     @property
     def removed_of_all(self) -> str:
@@ -230,9 +230,6 @@ def import_splats(
     path = path_of(path, "path")
     check_type(settings, ImportSettings, "settings", "for example mitsplat.ImportSettings(units=0.001)")
     check_text(name, "name")
-    for key, given in (("density", density), ("mass", mass), ("friction", friction)):
-        if key == "friction" or given is not None:
-            check_number(given, key)
     _check_physics(density, mass, friction)
     stages = iter(range(_STAGES))
 
@@ -258,12 +255,11 @@ def import_splats(
             raise InputError(f"{path}: has no flat surface below the object: leave out --without-table")
         cleaner.remove("table", ~cut_support(cleaner.splats, upright.support), "nothing stands on the flat surface")
         cleaner.remove_floaters(kind)
-    splats = cleaner.splats.transformed(turn)
     support = None
     if kind == "environment" and upright.support is not None:
-        support, placed = _align_to_support(splats, upright.support)
+        support, placed = _align_to_support(cleaner.splats.transformed(turn), upright.support)
         turn = placed @ turn
-        splats = cleaner.splats.transformed(turn)
+    splats = cleaner.splats.transformed(turn)
     report("finding the surface")
     seen_below = kind == "object" and not settings.without_table
     mesh = _surface(splats, kind, settings, lowest=-1.0 if seen_below else 0.0)
@@ -286,39 +282,40 @@ def import_splats(
     asset, asset_from_file, factor = _in_metres(asset, turn, settings)
     if support is not None and factor is not None:
         support = replace(support, size=(factor * support.size[0], factor * support.size[1]))
-    views: list[AssetView] = []
-    mesh_iou = offset = None
-    if asset.mesh is not None:
-        report("comparing mesh and splats")
-        cameras = _cameras(asset.splats, kind, settings, _TEST_VIEWS, lowest=-0.3 if seen_below else 0.0, turn=0.7)
-        views = show_asset(asset.splats, asset.mesh, cameras)
-        offset = measure_offset(asset.mesh, surface_points(asset.splats, cameras)).shift
-        if kind == "object":
-            mesh_iou = float(np.mean([iou(view.alpha >= 0.5, view.mesh) for view in views]))
-            report("splitting the mesh into convex pieces")
-            asset = replace(asset, pieces=_pieces_of_parts(asset.mesh))
-    return Imported(
+    result = Imported(
         asset=asset,
         upright=upright,
         found=len(loaded),
         removed=cleaner.removed,
         removed_splats=cleaner.removed_splats().transformed(asset_from_file),
         support=support,
-        views=views,
-        mesh_iou=mesh_iou,
-        offset=offset,
         watertight=asset.mesh is not None and is_closed(asset.mesh),
         topples=kind == "object" and asset.mesh is not None and _topples(asset.mesh),
     )
+    if asset.mesh is None:
+        return result
+    report("comparing mesh and splats")
+    cameras = _cameras(asset.splats, kind, settings, _TEST_VIEWS, lowest=-0.3 if seen_below else 0.0, turn=0.7)
+    views = show_asset(asset.splats, asset.mesh, cameras)
+    offset = measure_offset(asset.mesh, surface_points(asset.splats, cameras)).shift
+    result = replace(result, views=views, offset=offset)
+    if kind == "environment":
+        return result
+    report("splitting the mesh into convex pieces")
+    asset = replace(asset, pieces=_pieces_of_parts(asset.mesh))
+    return replace(result, asset=asset, mesh_iou=float(np.mean([iou(v.alpha >= 0.5, v.mesh) for v in views])))
 
 
 def _check_physics(density: float | None, mass: float | None, friction: float) -> None:
     """Raise InputError if a physical value of an asset breaks a rule."""
+    for key, value in (("density", density), ("mass", mass)):
+        if value is not None:
+            check_number(value, key)
+            if not 0 < value < np.inf:
+                raise InputError(f"{key} must be finite and > 0 (got {value:g})")
     if density is not None and mass is not None:
         raise InputError("density and mass must not both be given")
-    for key, value in (("density", density), ("mass", mass)):
-        if value is not None and not 0 < value < np.inf:
-            raise InputError(f"{key} must be finite and > 0 (got {value:g})")
+    check_number(friction, "friction")
     if not 0 <= friction < np.inf:
         raise InputError(f"friction must be a number of at least 0 (got {friction:g})")
 

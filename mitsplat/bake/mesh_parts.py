@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import mitsuba as mi
 import numpy as np
@@ -398,7 +398,7 @@ def _bsdf(part: MeshPart) -> MitsubaDict:
     return {"type": "twosided", "bsdf": bsdf} if part.double_sided else bsdf
 
 
-def _channel(part: MeshPart, number: int, uniform: float) -> Any:
+def _channel(part: MeshPart, number: int, uniform: float) -> float | MitsubaDict:
     """Return a channel of the texture of metalness and roughness, or the uniform value if there is none."""
     texture = part.metallic_roughness
     if texture is None:

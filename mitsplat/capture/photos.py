@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -211,7 +210,7 @@ def _prepare(
                 kept_exif = exif.tobytes()
             except (ValueError, TypeError, AttributeError, struct.error):  # value types that no file can store
                 kept_exif = b""
-            options: dict[str, Any] = {"quality": 95, "subsampling": 0} if lossy else {}
+            options: dict[str, int | bytes] = {"quality": 95, "subsampling": 0} if lossy else {}
             options["exif"] = kept_exif if len(kept_exif) < 65_000 else b""  # limit of a JPEG segment
             write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", **options))
     focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)

@@ -19,7 +19,7 @@ import threading
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 zlib.compress(b"before pycolmap")
 
@@ -28,6 +28,10 @@ import pycolmap  # noqa: E402
 
 from mitsplat.runtime.child_process import limit_memory  # noqa: E402
 from mitsplat.runtime.cores import usable_cores  # noqa: E402
+
+if TYPE_CHECKING:
+    from mitsplat.arrays import Float64Array
+    from mitsplat.storage.files import JsonObject
 
 SEED = 1
 SEQUENTIAL_OVERLAP = 10
@@ -68,7 +72,7 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def run(job: dict[str, Any], folder: Path) -> None:
+def run(job: JsonObject, folder: Path) -> None:
     """Find or read a model and store it.
 
     Args:
@@ -113,7 +117,7 @@ def read_model(source: Path) -> pycolmap.Reconstruction:
                 values = line.split(maxsplit=9)
                 model.image(int(values[0])).name = values[9].rstrip()
                 next(lines, None)  # points of the image
-    poses: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = {}
+    poses: dict[str, Float64Array] = {}
     for index in model.reg_image_ids():
         image = model.image(index)
         pose = image.cam_from_world().matrix()
@@ -129,7 +133,7 @@ def write_status(folder: Path, doing: str) -> None:
     part.replace(folder / "status")  # atomic, because the parent reads it at any time
 
 
-def assign_ids(job: dict[str, Any], images: Path, database: Path) -> None:
+def assign_ids(job: JsonObject, images: Path, database: Path) -> None:
     """Assign image ids in the order of the job; photos of a group share a camera.
 
     Several threads store features in arbitrary order. Without this step, ids would differ between runs, and with them
@@ -152,7 +156,7 @@ def assign_ids(job: dict[str, Any], images: Path, database: Path) -> None:
         pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, names, reader)
 
 
-def extract(job: dict[str, Any], images: Path, database: Path, folder: Path) -> None:
+def extract(job: JsonObject, images: Path, database: Path, folder: Path) -> None:
     """Compute SIFT features of the photos that have none yet."""
     assign_ids(job, images, database)
     # Later than the creation of the database, which fails while the parent reads it.
@@ -190,7 +194,7 @@ def rename_images(database: Path, names: Mapping[str, str]) -> None:
             opened.update_image(image)
 
 
-def match(job: dict[str, Any], database: Path, folder: Path) -> None:
+def match(job: JsonObject, database: Path, folder: Path) -> None:
     """Compute verified matches of the pairs that have none yet."""
     write_status(folder, "matching")
     matching = pycolmap.FeatureMatchingOptions()
@@ -267,7 +271,7 @@ def largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Re
     return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
-def known_model(cameras: dict[str, dict[str, Any]], database: Path) -> pycolmap.Reconstruction:
+def known_model(cameras: dict[str, JsonObject], database: Path) -> pycolmap.Reconstruction:
     """Return a model with known cameras and without points.
 
     Args:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -73,7 +72,7 @@ After an intended change of the renderer, inspect light and picture, then replac
 """
 
 
-def render_trial(**options: Any) -> Layers:
+def render_trial(**options: object) -> Layers:
     """Render a ball in front of a wall on a floor, lit by a lamp and a sky.
 
     The wall occludes light in the captured floor, and the ball is an added object that occludes light.

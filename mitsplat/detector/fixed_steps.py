@@ -189,7 +189,7 @@ class _PlanSampler(Sampler[int]):
 class _FixedStepsTrainer:
     """Common part of the box and the mask trainer."""
 
-    def __init__(self, job: Job, settings: dict[str, Any], callbacks: dict[str, Any]) -> None:
+    def __init__(self, job: Job, settings: dict[str, Any], callbacks: dict[str, list[Callable[[Any], None]]]) -> None:
         self.job, self.order, self.taken, self.updates = job, _PlanSampler(job.plan), 0, 0
         super().__init__(overrides=settings, _callbacks=callbacks)  # type: ignore[call-arg]
 

@@ -15,10 +15,13 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import TYPE_CHECKING
 
 from mitsplat.errors import InputError, MissingResourceError, list_in_words
 from mitsplat.storage.cache import remove_in_process
+
+if TYPE_CHECKING:
+    import torch
 
 WEIGHTS_ERRORS = (
     *(OSError, EOFError, UnpicklingError, RuntimeError),
@@ -205,7 +208,7 @@ def linked_weights(path: Path) -> Iterator[str]:
         yield str(link)
 
 
-def load_weights(path: Path) -> Any:
+def load_weights(path: Path) -> torch.nn.Module:
     """Load the network of a weights file.
 
     Raises:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -56,7 +55,7 @@ def error_gains(truth: JsonObject, detections: Sequence[Detection], before: Aver
     }
 
 
-def _by_image(entries: Sequence[JsonObject]) -> dict[int, list[Any]]:
+def _by_image(entries: Sequence[JsonObject]) -> dict[int, list[JsonObject]]:
     found = defaultdict(list)
     for entry in entries:
         found[entry["image_id"]].append(entry)

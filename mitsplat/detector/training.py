@@ -21,7 +21,6 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, check_masks, reorder_classes
 from mitsplat.detector.labelled_sets.set_reading import read_set
@@ -368,7 +367,7 @@ def _existing_run(out: Path, record: JsonObject) -> Run | None:
     return kept
 
 
-def _digests(described: Any) -> list[str]:
+def _digests(described: JsonObject | list[JsonObject] | None) -> list[str]:
     sets = described if isinstance(described, list) else [described] if described else []
     return [found["digest"] for found in sets]
 

@@ -106,7 +106,7 @@ class WorkerProcesses(Generic[Result]):
         with children_on_gpu(None, **{VISIBLE_GPUS: ""}):
             self._helpers.append(self._start_process(name, _help, (self._jobs,)))
 
-    def _start_process(self, name: str, target: Callable[..., None], arguments: Any) -> BaseProcess:
+    def _start_process(self, name: str, target: Callable[..., None], arguments: tuple[object, ...]) -> BaseProcess:
         process = self._spawn.Process(target=target, args=arguments, name=name, daemon=True)
         with safe_path_children(), _short_arguments():
             resource_tracker.ensure_running()  # its start together with the first worker would unblock SIGINT

@@ -74,14 +74,14 @@ def _mean_psnr(photos: Sequence[HeldOut]) -> float:
     return float(np.mean([photo.psnr for photo in photos]))
 
 
-def read_record(path: Path) -> Any:
+def read_record(path: Path) -> JsonObject:
     """Read ``fit.json`` and check its format version; the keys are not checked.
 
     Raises:
         InputError: If the file is missing, not JSON, or of a newer version.
     """
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record: JsonObject = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file: has the fit finished?") from None
     except (OSError, ValueError) as error:

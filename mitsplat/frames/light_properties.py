@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +14,7 @@ from mitsplat.renderer.emitters.emitter_sampling import reference_irradiance
 from mitsplat.renderer.scene_emitters import MitsubaDict
 from mitsplat.scene.planning.frame_lights import expand_rooms, lights_at
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec.light_spec import EnvironmentLight
+from mitsplat.scene.spec.light_spec import EnvironmentLight, LightSpec
 from mitsplat.scene.walls import backdrop_distance
 
 CALIBRATION_DRAWS = 16
@@ -94,7 +93,7 @@ def capture_irradiance(scene: Scene) -> Irradiance:
     return red, green, blue
 
 
-def _varies(light: Any) -> bool:
+def _varies(light: LightSpec) -> bool:
     """Return True if a light differs between frames."""
     moves = light.pool is not None if isinstance(light, EnvironmentLight) else bool(light.path)
     return moves or light.draw is not None

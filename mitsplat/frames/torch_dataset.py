@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -93,7 +92,7 @@ def sample_of(frame: Frame) -> Sample:
     for mask, label in zip(masks, labels, strict=True):
         x0, y0, x1, y1 = label.box
         mask[y0:y1, x0:x1] = label.mask
-    target: dict[str, Any] = {
+    target: dict[str, torch.Tensor] = {
         "boxes": torch.tensor([label.box for label in labels], dtype=torch.float32).reshape(-1, 4),
         "labels": torch.tensor([label.class_index + 1 for label in labels], dtype=torch.int64),
         "masks": torch.from_numpy(masks),

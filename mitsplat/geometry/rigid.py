@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
@@ -100,7 +98,7 @@ def nearest_rigid(matrix: Float64Array) -> Float64Array:
     return nearest
 
 
-def points_of(value: Any, place: str) -> Float64Array:
+def points_of(value: npt.ArrayLike, place: str) -> Float64Array:
     """Return an argument of the Python API as points (N, 3); one point may be (3,).
 
     Raises:

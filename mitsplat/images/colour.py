@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from functools import lru_cache
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 import numpy.typing as npt
@@ -120,7 +120,7 @@ def _xyz_from_srgb() -> Float64Array:
     return np.asarray(_colour_science().RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ, dtype=np.float64)
 
 
-def _colour_science() -> Any:
+def _colour_science() -> ModuleType:
     """Import colour-science without its warning that plots need Matplotlib."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

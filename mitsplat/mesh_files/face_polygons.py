@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import mapbox_earcut
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.arrays import Float64Array, Int64Array, IntegerArray
+
+Polygon = Sequence[int] | IntegerArray
+"""Vertices of a polygon."""
 
 _KINDS = (b"v", b"vt", b"vn")
 _TO_REWRITE = re.compile(rb"^f (?:[^\n]*[ /])?[-0]|^f(?: \S+){4}", re.M)
@@ -56,7 +58,7 @@ def plain_obj(content: bytes) -> bytes:
     return b"\n".join(rows) + b"\n"
 
 
-def split_polygons(positions: Float64Array, polygons: Sequence[Any]) -> list[Int64Array]:
+def split_polygons(positions: Float64Array, polygons: Sequence[Polygon]) -> list[Int64Array]:
     """Split polygons into triangles of their corners: by fans, except for concave polygons.
 
     Args:
@@ -81,7 +83,7 @@ def split_polygons(positions: Float64Array, polygons: Sequence[Any]) -> list[Int
     return found
 
 
-def has_concave(positions: Float64Array, polygons: Sequence[Any]) -> bool:
+def has_concave(positions: Float64Array, polygons: Sequence[Polygon]) -> bool:
     """Return True if the fan of a polygon overlaps itself.
 
     Raises:
@@ -90,7 +92,7 @@ def has_concave(positions: Float64Array, polygons: Sequence[Any]) -> bool:
     return any(_fans(positions, rows)[1].any() for _, rows in _equal_lengths(polygons, len(positions)))
 
 
-def _equal_lengths(polygons: Sequence[Any], count: int) -> Iterator[tuple[Int64Array, Int64Array]]:
+def _equal_lengths(polygons: Sequence[Polygon], count: int) -> Iterator[tuple[Int64Array, Int64Array]]:
     """Yield the numbers of the polygons of each length, and their vertices (N, length) of ``count``.
 
     Raises:

@@ -198,7 +198,7 @@ def means_of(gloss: Texture) -> tuple[float, float]:
     return float(metallic), float(roughness)
 
 
-def item(values: Any, index: Any, kind: str) -> Any:
+def item(values: object, index: object, kind: str) -> Any:
     """Return an item of a list of a file.
 
     Raises:

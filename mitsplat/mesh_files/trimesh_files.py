@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import trimesh
 from PIL import Image
 from trimesh.resolvers import FilePathResolver
 from trimesh.visual import ColorVisuals
 from trimesh.visual.color import to_rgba
+from trimesh.visual.material import Material as TrimeshMaterial
 from trimesh.visual.material import PBRMaterial, SimpleMaterial, empty_material
 
 from mitsplat.arrays import Float64Array
@@ -28,7 +30,7 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.images.colour import decode_srgb
 from mitsplat.mesh_files.collada_files import check_collada, collada_warnings, lost_node, plain_name, read_collada_asset
-from mitsplat.mesh_files.face_polygons import has_concave, plain_obj, split_polygons
+from mitsplat.mesh_files.face_polygons import Polygon, has_concave, plain_obj, split_polygons
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import (
     DIELECTRIC_SPECULAR,
@@ -334,14 +336,14 @@ def _read_part(name: str, mesh: trimesh.Trimesh, transform: Float64Array) -> Fil
     return FilePart(name, vertices, faces, transform, material, linear, double_sided)
 
 
-def _is_empty(material: Any) -> bool:
+def _is_empty(material: TrimeshMaterial) -> bool:
     """Return True for the dark grey image that trimesh uses for texture coordinates without a material."""
     if not isinstance(material, SimpleMaterial) or material.kwargs or material.image is None:
         return False
     return np.array_equal(np.asarray(material.image), np.asarray(empty_material().image))
 
 
-def read_material(material: Any, uv: Float64Array | None = None) -> Material:
+def read_material(material: TrimeshMaterial, uv: Float64Array | None = None) -> Material:
     """Convert a material of trimesh on faces with texture coordinates (F, 3, 2), or None without any."""
     if isinstance(material, SimpleMaterial):
         return _read_mtl(material, uv)
@@ -386,7 +388,7 @@ def _texture(image: Image.Image | None, uv: Float64Array | None) -> Texture | No
 
 def _read_mtl(source: SimpleMaterial, uv: Float64Array | None) -> Material:
     """Convert an MTL material from the file's own keys, because trimesh inserts dark grey for an absent ``Kd``."""
-    keys: Mapping[str, Any] = source.kwargs
+    keys: Mapping[str, npt.ArrayLike] = source.kwargs
     warnings: list[str] = []
     texture = _texture(source.image, uv)
     if source.image is not None and uv is None:
@@ -443,7 +445,7 @@ def _read_mtl(source: SimpleMaterial, uv: Float64Array | None) -> Material:
     )
 
 
-def _numbers(keys: Mapping[str, Any], name: str) -> Float64Array | None:
+def _numbers(keys: Mapping[str, npt.ArrayLike], name: str) -> Float64Array | None:
     """Return the numbers of an MTL key, or None if it is absent or damaged."""
     try:
         given = keys[name]
@@ -498,7 +500,7 @@ def _polygons(path: Path, scene: trimesh.Scene, document: Any) -> Iterator[tuple
                     yield one.vertex, one.vertex_index
 
 
-def _split_faces(scene: trimesh.Scene, positions: Float64Array, polygons: Sequence[Any]) -> bool:
+def _split_faces(scene: trimesh.Scene, positions: Float64Array, polygons: Sequence[Polygon]) -> bool:
     """Replace the triangles of the only mesh of a scene by those of its polygons, concave ones included.
 
     Returns:

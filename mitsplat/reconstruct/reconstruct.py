@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -147,7 +147,7 @@ class Reconstruction:
     refinement: RefinedMesh | None
     asset_from_capture: Float64Array
     sections: tuple[str, ...] = ()
-    record: Mapping[str, Any] = field(default_factory=dict)
+    record: Mapping[str, object] = field(default_factory=dict)
     pose: RefinedPose | None = None
 
 

@@ -18,7 +18,7 @@ import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import mitsuba as mi
 
@@ -227,7 +227,7 @@ def visible_gpus() -> tuple[Gpu, ...] | MissingPrerequisite:
     return tuple(found if os.environ.get(VISIBLE_GPUS) else sorted(found, key=lambda gpu: gpu.bus))
 
 
-def _gpu(driver: Any, ordinal: int, unused: Mapping[str, int], *, alone: bool) -> Gpu:
+def _gpu(driver: ctypes.CDLL, ordinal: int, unused: Mapping[str, int], *, alone: bool) -> Gpu:
     name, bus, number = (ctypes.create_string_buffer(size) for size in (256, 64, 16))
     handle, memory = ctypes.c_int(0), ctypes.c_size_t(0)
     driver.cuDeviceGet(ctypes.byref(handle), ordinal)
@@ -245,7 +245,7 @@ def _gpu(driver: Any, ordinal: int, unused: Mapping[str, int], *, alone: bool) -
     )
 
 
-def _library(name: str) -> Any:
+def _library(name: str) -> ctypes.CDLL | None:
     """Load a library of the driver, or return None."""
     try:
         return ctypes.CDLL(name)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 import re
-from typing import Any, Literal
+from types import ModuleType
+from typing import Literal
 
 from mitsplat.errors import MissingResourceError
 
@@ -12,7 +13,7 @@ MIN_ONNXRUNTIME = (1, 24)
 """First release of ONNX Runtime that reads no weights from outside the network's folder."""
 
 
-def load_library(extra: Literal["depth", "masks"], name: str) -> Any:
+def load_library(extra: Literal["depth", "masks"], name: str) -> ModuleType:
     """Import a library that runs networks by ONNX Runtime.
 
     Args:

@@ -158,7 +158,7 @@ def key_place(path: str | Path, keys: KeyPath) -> str:
     return _place(path, _line(_parse(path), keys) if path.exists() else None, keys)
 
 
-def _to_file_values(value: Any) -> Any:
+def _to_file_values(value: object) -> Any:
     """Convert a value to mappings, lists and scalars as in a file."""
     if isinstance(value, BaseModel):
         # dict(value) would call a field named ``keys``.
@@ -209,7 +209,7 @@ def _parse(path: Path) -> CommentedMap:
     return tree
 
 
-def _plain(node: Any, keys: KeyPath, tree: CommentedMap, path: Path, values: Iterator[int]) -> Any:
+def _plain(node: object, keys: KeyPath, tree: CommentedMap, path: Path, values: Iterator[int]) -> Any:
     """Convert a node to built-in dicts, lists and scalars; refuse values without a JSON equivalent."""
     if len(keys) > MAX_DEPTH:
         raise InputError(f"{path}: must not nest deeper than {MAX_DEPTH} levels")
@@ -253,12 +253,12 @@ def _finding(
     model: type[BaseModel],
     data: dict[str, Any],
     tree: CommentedMap | None,
-    overridden: Mapping[tuple[str, ...], Any],
+    overridden: Mapping[tuple[str, ...], object],
 ) -> _Finding:
     """Convert one error of pydantic to a finding in terms of the file, if there is one."""
     kind, context, location = details["type"], details.get("ctx", {}), details["loc"]
     keys = _file_path(location, data, keep_last=kind == "missing")
-    value: Any = details["input"]
+    value: object = details["input"]
     cause = context.get("error")
     if isinstance(cause, FieldError):
         keys += cause.key
@@ -291,7 +291,7 @@ def _is_consequence(finding: _Finding, findings: Sequence[_Finding]) -> bool:
     )
 
 
-def _file_path(location: KeyPath, data: Any, *, keep_last: bool) -> KeyPath:
+def _file_path(location: KeyPath, data: object, *, keep_last: bool) -> KeyPath:
     """Remove the names of union members from pydantic's location, because they are not in the file."""
     keys: list[str | int] = []
     for position, part in enumerate(location):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import html
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -112,7 +112,7 @@ def reconstruct_environment(
         "Removed Gaussians": ", ".join(f"{count} {reason}" for reason, count in removed.items()),
         "Background": f"{int(background.sum())} Gaussians far behind the focus of the cameras, which are kept",
     }
-    findings, sections, record = list[str](), list[str](), dict[str, Any]()
+    findings, sections, record = list[str](), list[str](), dict[str, object]()
     if found:
         surfaces = _describe_surfaces(capture, splats, found, views, points, scale, removed_objects, made.asset, larger)
         rows |= surfaces.rows

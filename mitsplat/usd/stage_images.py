@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from mitsplat.storage.files import JsonObject
 
 if TYPE_CHECKING:
-    from pxr import Usd
+    from pxr import Usd, UsdRender
 
 EXPAND = "expandAperture"
 """Default policy of UsdRender."""
@@ -77,7 +77,7 @@ def fit_aperture(across: float, up: float, image_aspect: float, policy: str) -> 
     return across, across / image_aspect
 
 
-def _products(stage: Usd.Stage) -> list[Any]:
+def _products(stage: Usd.Stage) -> list[UsdRender.Product]:
     from pxr import UsdRender  # optional
 
     return [UsdRender.Product(prim) for prim in stage.Traverse() if prim.IsA(UsdRender.Product)]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from pxr import Usd
+    from pxr import Usd, UsdPhysics
 
 Record = dict[str, Any]
 """Values of a prim, by key."""
@@ -70,7 +70,7 @@ def mass_of_colliders(body: Usd.Prim, volume_of: Callable[[Usd.Prim], float]) ->
         values = [own.GetMassAttr().Get(), own.GetDensityAttr().Get()] if own else []
         return any([*values, material.GetDensityAttr().Get() if material else None])
 
-    def information(collider: Usd.Prim) -> Any:
+    def information(collider: Usd.Prim) -> UsdPhysics.RigidBodyAPI.MassInformation:
         found = UsdPhysics.RigidBodyAPI.MassInformation()
         found.volume, found.inertia = volume_of(collider), Gf.Matrix3f(1.0)
         found.centerOfMass, found.localPos, found.localRot = Gf.Vec3f(0.0), Gf.Vec3f(0.0), Gf.Quatf(1.0)
@@ -93,7 +93,7 @@ def contact_of(prim: Usd.Prim, time: Usd.TimeCode) -> Record:
     }
 
 
-def physics_material(prim: Usd.Prim) -> Any:
+def physics_material(prim: Usd.Prim) -> UsdPhysics.MaterialAPI | None:
     """Return the physics material that is bound to a collider, or None."""
     from pxr import UsdPhysics, UsdShade  # optional
 

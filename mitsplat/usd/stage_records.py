@@ -93,7 +93,7 @@ def write_records(output: BinaryIO, _: bytes, path: str, images: str) -> None:
     np.savez(output, allow_pickle=False, **arrays)
 
 
-def _without_arrays(value: Any, arrays: dict[str, AnyArray]) -> Any:
+def _without_arrays(value: object, arrays: dict[str, AnyArray]) -> Any:
     """Return a record whose arrays are replaced by their names in ``arrays``."""
     if isinstance(value, np.ndarray):
         arrays[f"a{len(arrays)}"] = value
@@ -103,7 +103,7 @@ def _without_arrays(value: Any, arrays: dict[str, AnyArray]) -> Any:
     return [_without_arrays(one, arrays) for one in value] if isinstance(value, list) else value
 
 
-def _with_arrays(value: Any, arrays: dict[str, AnyArray]) -> Any:
+def _with_arrays(value: object, arrays: dict[str, AnyArray]) -> Any:
     if isinstance(value, dict):
         if value.keys() == {"array"}:
             return arrays[value["array"]]

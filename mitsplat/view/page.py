@@ -245,7 +245,7 @@ class Page:
 
         box.on_update(lambda _: setattr(root, "visible", box.value))
 
-    def _add(self, part: ShownPart) -> Any:
+    def _add(self, part: ShownPart) -> viser.SceneNodeHandle:
         scene, drawable = self._server.scene, part.drawable
         place = {"position": part.pose[:3, 3], "wxyz": _wxyz(part.pose)}
         if isinstance(drawable, ShownSplats):
@@ -278,7 +278,7 @@ class Page:
             )
         return self._add_frustum(part.name, drawable, place)
 
-    def _add_frustum(self, name: str, drawable: Frustum, place: dict[str, Any]) -> Any:
+    def _add_frustum(self, name: str, drawable: Frustum, place: dict[str, Float64Array]) -> viser.CameraFrustumHandle:
         camera, height = drawable.camera, 0.5 * drawable.camera.height / drawable.camera.fy
         aspect = camera.width / camera.height
         handle = self._server.scene.add_camera_frustum(

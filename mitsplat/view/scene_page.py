@@ -61,7 +61,7 @@ class ScenePage:
         self._page_poses: list[Float64Array] = []
         self._lights: dict[int, LightSpec] = {}
         self._layout: Layout | None = None
-        self._cameras: tuple[Any, list[ShownPart]] = (None, [])
+        self._cameras: tuple[object, list[ShownPart]] = (None, [])
         self._playing = False
         self._fault: str | None = None
         self._last_request: ViewRequest | None = None

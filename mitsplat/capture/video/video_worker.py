@@ -15,7 +15,6 @@ import resource
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -109,7 +108,7 @@ def _name(time: float) -> str:
     return f"{minutes:02}m{milliseconds // 1000:02}s{milliseconds % 1000:03}.jpg"
 
 
-def _send(**message: Any) -> None:
+def _send(**message: object) -> None:
     sys.stdout.write(f"{json.dumps(message)}\n")
     sys.stdout.flush()
 

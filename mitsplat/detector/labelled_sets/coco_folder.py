@@ -58,7 +58,7 @@ def _coco_part(root: Path, split: Split, path: Path, content: JsonObject, progre
         categories.sort(key=lambda category: category["id"])
         names = tuple(str(category["name"]) for category in categories)
         index = {category["id"]: i for i, category in enumerate(categories)}
-        by_image: dict[Any, list[JsonObject]] = {image["id"]: [] for image in content["images"]}
+        by_image: dict[int | str, list[JsonObject]] = {image["id"]: [] for image in content["images"]}
         for annotation in content["annotations"]:
             for key, known in (("image_id", by_image), ("category_id", index)):
                 if annotation[key] not in known:

@@ -59,7 +59,7 @@ def _with_image(sky: EnvironmentLight, rng: np.random.Generator) -> EnvironmentL
 def _draw_values(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int) -> LightSpec:
     """Return a light with values drawn from its ranges."""
 
-    def uniform(key: str, low: Any, high: Any) -> Any:
+    def uniform(key: str, low: float | tuple[float, ...], high: float | tuple[float, ...]) -> Any:
         value = random_stream(seed, f"light {name} {key}", number).uniform(low, high)
         return tuple(value.tolist()) if isinstance(value, np.ndarray) else float(value)
 

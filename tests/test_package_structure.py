@@ -164,6 +164,17 @@ def test_the_design_page_names_every_module() -> None:
             assert f"`{module.split('.')[-1]}`" in design, module
 
 
+def test_the_design_page_names_existing_modules() -> None:
+    files = {path.relative_to(ROOT).as_posix() for path in MODULES.values()}
+    files |= {
+        path.relative_to(ROOT).as_posix()
+        for folder in ("tests", "benchmarks")
+        for path in ROOT.glob(f"{folder}/**/*.py")
+    }
+    for name in re.findall(r"`([\w/]+\.py)`", (ROOT / "docs/design.md").read_text()):
+        assert any(f"/{file}".endswith(f"/{name}") for file in files), name
+
+
 def imports_inside(path: Path) -> Iterator[tuple[int, bool]]:
     """Return the lines of imports inside functions, and True for each import with a stated reason.
 

@@ -95,7 +95,7 @@ class SceneCheck(DatasetCheck):
                 yield "its camera does not look at the target of the scene's path"
             return
         target, tolerance = camera["target"], _SIGMAS * camera.get("target_jitter", 0.0) + _POSITION_TOLERANCE
-        if (stated := _viewpoint(frame).get("target")) is not None:
+        if (stated := (frame.record.get("viewpoint") or {}).get("target")) is not None:
             target, tolerance = stated, _POSITION_TOLERANCE  # the record states the drawn target
         offset = eye - target
         if camera["kind"] == "orbit":
@@ -134,11 +134,6 @@ def _check_fixed_pose(camera: JsonObject, pose: Float64Array) -> Iterator[str]:
     angle = float(2 * np.degrees(np.arcsin(min(1.0, sine))))
     if angle > _SIGMAS * camera["rotation_jitter"] + np.degrees(_POSITION_TOLERANCE):
         yield f"its camera is turned by {angle:.3g} degrees from the scene's fixed camera"
-
-
-def _viewpoint(frame: DecodedFrame) -> JsonObject:
-    """Return the drawn values of a frame's camera."""
-    return frame.record.get("viewpoint") or {}
 
 
 def _held_out(scene: JsonObject) -> set[int]:

@@ -75,7 +75,9 @@ class DetectionMatches:
         with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints progress messages
             labelled = _coco(truth)
             found = (
-                labelled.loadRes([dict(detection) for detection in detections]) if detections else _no_detections(truth)
+                labelled.loadRes([dict(detection) for detection in detections])
+                if detections
+                else _coco({**truth, "annotations": []})
             )
             self._eval = COCOeval(labelled, found, iou_type)
             self._eval.params.maxDets = [MAX_DETECTIONS]
@@ -202,7 +204,3 @@ def _coco(content: JsonObject) -> COCO:
     coco.dataset = dict(content)
     coco.createIndex()
     return coco
-
-
-def _no_detections(truth: JsonObject) -> COCO:
-    return _coco({"images": truth["images"], "categories": truth["categories"], "annotations": []})

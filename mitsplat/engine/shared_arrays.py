@@ -48,7 +48,7 @@ class SharedArrays(Generic[Value]):
             self._file = _write_parts(_in_cache(), places)
         except OSError as error:
             _logger.warning("%s: cannot be written (%s): workers share memory instead", cache_folder(), error)
-            self._file = _write_parts(_in_memory(), places)
+            self._file = _write_parts(os.fdopen(os.memfd_create("mitsplat"), "w+b"), places)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _open, (DupFd(self._file.fileno()), self.size)
@@ -76,10 +76,6 @@ def _in_cache() -> IO[bytes]:
     folder = cache_folder()
     folder.mkdir(parents=True, exist_ok=True)
     return tempfile.TemporaryFile(dir=folder)
-
-
-def _in_memory() -> IO[bytes]:
-    return os.fdopen(os.memfd_create("mitsplat"), "w+b")
 
 
 def _open(handle: Any, end: int) -> Any:

@@ -159,12 +159,8 @@ def guarded(guard: Guard) -> Iterator[MessageThreads]:
 def _logger() -> logging.Logger:
     """Return a logger that omits the tracebacks of failed handshakes, which any visitor could cause."""
     logger = logging.getLogger(__name__)
-    logger.addFilter(_is_no_handshake)
+    logger.addFilter(lambda record: record.msg != "opening handshake failed")
     return logger
-
-
-def _is_no_handshake(record: logging.LogRecord) -> bool:
-    return record.msg != "opening handshake failed"
 
 
 def check_address(host: str, port: int) -> None:

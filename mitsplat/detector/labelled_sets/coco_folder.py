@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -114,7 +114,8 @@ def _coco_files(root: Path, split: Split) -> dict[Path, JsonObject]:
     if len(files) == 1 or (files and split == "all"):
         return files
     if files:
-        raise InputError(f"{root}: one of its COCO files must have {split} in its name (got {_file_names(files)})")
+        names = ", ".join(path.name for path in files)
+        raise InputError(f"{root}: one of its COCO files must have {split} in its name (got {names})")
     raise InputError(
         f"{root}: must be a dataset of mitsplat (dataset.json), a YOLO folder (data.yaml) or a COCO folder (a JSON "
         "file with images, annotations and categories)"
@@ -124,10 +125,6 @@ def _coco_files(root: Path, split: Split) -> dict[Path, JsonObject]:
 def _split_words(path: Path) -> list[str]:
     """Return the words of a path, those of other tools' splits translated."""
     return [_SPLIT_FOLDERS.get(word, word) for word in re.findall("[a-z]+", str(path.with_suffix("")).lower())]
-
-
-def _file_names(files: Iterable[Path]) -> str:
-    return ", ".join(path.name for path in files)
 
 
 def _read_json(path: Path) -> Any:

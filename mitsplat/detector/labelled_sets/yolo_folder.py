@@ -97,10 +97,7 @@ def _read_images(
     )
     if not images:
         sought = ", ".join(str(root / entry) for name in wanted for entry in listed[name])
-        raise InputError(
-            f"{root}: there are no images for {split}"
-            + (_split_counts_text(_split_counts(root, listed)) or f" in {sought}")
-        )
+        raise InputError(f"{root}: there are no images for {split}" + (_split_counts(root, listed) or f" in {sought}"))
     if not any(_label_file(image).is_file() for image in images):
         raise InputError(f"{root}: its images have no labels, such as {_label_file(images[0])}")
 
@@ -133,11 +130,9 @@ def _split_entry(root: Path, base: str, entry: str) -> str:
     return str(Path(base, inner)) if inner != entry and not (root / place).exists() else place
 
 
-def _split_counts(root: Path, listed: dict[str, list[str]]) -> dict[str, int]:
-    return {name: sum(len(_listed_images(root, entry)) for entry in entries) for name, entries in listed.items()}
-
-
-def _split_counts_text(counts: dict[str, int]) -> str:
+def _split_counts(root: Path, listed: dict[str, list[str]]) -> str:
+    """Return the numbers of images of the splits in words; empty if there are none."""
+    counts = {name: sum(len(_listed_images(root, entry)) for entry in entries) for name, entries in listed.items()}
     shown = ", ".join(f"{count} for {name}" for name, count in counts.items() if count)
     return f" (it has {shown})" if shown else ""
 

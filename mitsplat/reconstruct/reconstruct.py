@@ -221,16 +221,7 @@ def reconstruct_asset(
         units=capture.units,
         capture_light="uniform" if job.kind == "object" else "scene",
     )
-    asset_from_capture = np.eye(4)
-    if settings.size is not None:
-        turn = _alignment_rotation(mesh)
-        asset = asset.transformed(turn)
-        asset_from_capture = np.diag([*[asset.factor_to(settings.size)] * 3, 1.0]) @ turn
-        asset = asset.resized(settings.size)
-    elif capture.units == "unknown" and alignment is not None and imported and imported.metres_per_unit:
-        metres = imported.metres_per_unit / alignment.scale
-        asset = replace(asset.scaled(metres), units="metre")
-        asset_from_capture = np.diag([metres, metres, metres, 1.0])
+    asset, asset_from_capture = _in_metres(asset, job, alignment)
     if job.kind == "object":
         if progress is not None:
             progress(0, 1, "splitting the mesh into convex pieces")
@@ -254,6 +245,23 @@ def _may_stand_on_table(splats: Splats) -> bool:
         > -_MAX_SHARE_BELOW
         * np.ptp(np.quantile(splats.means, (_MAX_SHARE_BELOW, 1 - _MAX_SHARE_BELOW), axis=0), axis=0).max()
     )
+
+
+def _in_metres(asset: Asset, job: AssetJob, alignment: Alignment | None) -> tuple[Asset, Float64Array]:
+    """Scale an asset to the stated size, or by the unit of an imported mesh if its own units are unknown.
+
+    Returns:
+        The asset, and the transform (4, 4) from the frame of the capture to its own.
+    """
+    size, imported = job.settings.size, job.imported
+    if size is not None:
+        turn = _alignment_rotation(asset.mesh)
+        asset = asset.transformed(turn)
+        return asset.resized(size), np.diag([*[asset.factor_to(size)] * 3, 1.0]) @ turn
+    if asset.units == "unknown" and alignment is not None and imported is not None and imported.metres_per_unit:
+        metres = imported.metres_per_unit / alignment.scale
+        return replace(asset.scaled(metres), units="metre"), np.diag([metres, metres, metres, 1.0])
+    return asset, np.eye(4)
 
 
 def _alignment_rotation(mesh: trimesh.Trimesh) -> Float64Array:

@@ -105,10 +105,8 @@ def reconstruct_environment(
         imported = ImportedMesh(mesh, np.eye(4))
     made = reconstruct_asset(capture, splats, replace(job, imported=imported, remove=()), psnr=psnr, progress=progress)
     made, larger = _without_rotation(made, motion)
-    error = "" if capture.scale_error is None else f" ± {capture.scale_error:.2%}"
     rows = {
-        "Frame": f"{'in metres' if made.asset.units == 'metre' else 'in unknown units'}{error}"
-        + (f", by {source}" if source else ""),
+        "Frame": _frame_text(made.asset.units, capture.scale_error, source),
         "Removed Gaussians": ", ".join(f"{count} {reason}" for reason, count in removed.items()),
         "Background": f"{int(background.sum())} Gaussians far behind the focus of the cameras, which are kept",
     }
@@ -134,6 +132,13 @@ def reconstruct_environment(
         psnr = _mean_psnr(made.held_out, fitted if removed_objects else None)
     verdict = replace(made.verdict, psnr=psnr, rows=rows, findings=tuple(findings))
     return replace(made, verdict=verdict, sections=tuple(sections), record=record)
+
+
+def _frame_text(units: str, scale_error: float | None, source: str | None) -> str:
+    """Describe the units of an environment, their relative error, and what they are known from."""
+    error = "" if scale_error is None else f" ± {scale_error:.2%}"
+    by = f", by {source}" if source else ""
+    return f"{'in metres' if units == 'metre' else 'in unknown units'}{error}{by}"
 
 
 class _Surfaces(NamedTuple):

@@ -45,6 +45,9 @@ class AnnotationFile:
     Args:
         root: Dataset folder.
         file: File, relative to the dataset.
+
+    Attributes:
+        counts: Numbers of the images and annotations that were read.
     """
 
     def __init__(self, root: Path, file: str) -> None:

@@ -44,6 +44,9 @@ class EntryCursor(Generic[Entry]):
         file: File, relative to the dataset.
         entries: Frame index and entry of each, by ascending index.
         noun: Plural of the entries in messages.
+
+    Attributes:
+        broken: True after an error, so that no further entries are read.
     """
 
     def __init__(self, file: str, entries: Iterator[tuple[int, Entry]], noun: str = "entries") -> None:

@@ -317,13 +317,13 @@ def _check_resumable(
         )
     stored = read_shard(out)
     if stored != shard:
-        before, now = (
-            f"shard {part['shard']}/{part['of']} of {part['frames']} images" if part else "a whole dataset"
-            for part in (stored, shard)
-        )
-        raise InputError(
-            f"{out}: cannot be resumed: it was {before} and is {now}: overwrite it or choose another folder"
-        )
+        change = f"it was {describe_shard(stored)} and is {describe_shard(shard)}"
+        raise InputError(f"{out}: cannot be resumed: {change}: overwrite it or choose another folder")
+
+
+def describe_shard(part: dict[str, int] | None) -> str:
+    """Return the content of ``shard.json`` in words."""
+    return f"shard {part['shard']}/{part['of']} of {part['frames']} images" if part else "a whole dataset"
 
 
 def read_shard(out: Path) -> dict[str, int] | None:

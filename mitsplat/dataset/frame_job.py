@@ -44,7 +44,15 @@ Settle = Callable[..., Layout]
 
 @dataclass
 class FrameJob:
-    """Callable that renders one frame and writes its files; the unit of work of the engine."""
+    """Callable that renders one frame and writes its files; the unit of work of the engine.
+
+    Attributes:
+        scene: The scene.
+        catalogue: Classes, keypoints and assets that labels refer to.
+        out: Dataset folder.
+        render: Function that renders a frame.
+        settle: Function that settles a layout.
+    """
 
     scene: Scene
     catalogue: Catalogue
@@ -168,7 +176,11 @@ class RemoteFrame:
 
 
 class RemoteFrameJob:
-    """Settling of layouts and rendering of frames on a machine without the caller's files; results are returned."""
+    """Settling of layouts and rendering of frames on a machine without the caller's files; results are returned.
+
+    Args:
+        job: The same work with the caller's files.
+    """
 
     def __init__(self, job: FrameJob) -> None:
         self.job = job

@@ -12,6 +12,7 @@ from pathlib import Path
 from mitsplat.dataset.dataset_files import CONTENT, RUNS, TIMINGS
 from mitsplat.dataset.dataset_folder import (
     DEFAULT_CONTENT,
+    describe_shard,
     finish_folder,
     first_difference,
     open_finished,
@@ -121,22 +122,13 @@ def _check_complete(folders: Sequence[Path]) -> int | None:
         return None
     sizes = {(part["of"], part["frames"]) for part in parts.values()}
     if len(parts) < len(stored) or len(sizes) > 1:
-        raise InputError(
-            "shards must be of one division of one dataset (got "
-            + ", ".join(
-                f"{folder}: {'whole' if part is None else _shard_name(part)}" for folder, part in stored.items()
-            )
-            + ")"
-        )
+        given = ", ".join(f"{folder}: {describe_shard(part)}" for folder, part in stored.items())
+        raise InputError(f"shards must be of one division of one dataset (got {given})")
     count, frames = next(iter(sizes))
     missing = set(range(1, count + 1)) - {part["shard"] for part in parts.values()}
     if missing or len(parts) > count:
         raise InputError(f"each of the {count} shards must be given once (missing: {sorted(missing) or 'none'})")
     return frames
-
-
-def _shard_name(part: dict[str, int]) -> str:
-    return f"{part['shard']}/{part['of']} of {part['frames']} frames"
 
 
 def _check_frames(manifests: Mapping[Path, Manifest], stated: int | None) -> int:

@@ -262,7 +262,13 @@ class IncompleteLayouts:
 
 @dataclass
 class FrameCounts:
-    """Statistics of a dataset, counted in one pass over its records."""
+    """Statistics of a dataset, counted in one pass over its records.
+
+    Attributes:
+        images, instances, dropped, marked: As in :class:`DatasetSummary`.
+        left_out: Objects that each layout lacks, by name.
+        placed: True if any image shows, or should show, an object with a class.
+    """
 
     images: Counter[str] = field(default_factory=Counter)
     instances: Counter[str] = field(default_factory=Counter)

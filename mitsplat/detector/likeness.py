@@ -207,7 +207,7 @@ def _zero_hue_sums() -> Float64Array:
 
 
 def _hue_histogram(pixels: ByteImage) -> Float64Array:
-    """Return the sum of the chroma [bytes] by hue, divided by the number of pixels, shape (_HUES,).
+    """Return the sum of the chroma [bytes] by hue, divided by the number of pixels, shape (_HUE_BINS,).
 
     ``pixels`` has shape (N, 3), BGR. Pixels without a hue count as zero.
     """

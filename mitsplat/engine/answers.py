@@ -49,6 +49,7 @@ class Failure:
 
     Attributes:
         user_error: Exception class, if its message is meant for the user.
+        kind, message, trace: Name of the exception's class, its message, and the traceback.
         exhausted: True if memory is exhausted.
     """
 

@@ -16,6 +16,10 @@ class FrameQueue:
 
     Args:
         layouts: Frames of each layout, in order.
+
+    Attributes:
+        waiting: Unassigned frames of each layout; layouts without any are absent.
+        left: Number of unassigned frames.
     """
 
     def __init__(self, layouts: Mapping[int, Sequence[int]]) -> None:

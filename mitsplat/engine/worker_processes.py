@@ -61,6 +61,13 @@ class WorkerProcesses(Generic[Result]):
     Nothing here waits for a worker that does not start. :mod:`multiprocessing` writes a process's start data into a
     pipe. It would wait forever for a process that dies before reading more than the pipe's capacity (64 KiB). The start
     data are therefore small, and the job itself is in a file, see :class:`SharedArrays`.
+
+    Args:
+        make: Function that makes a frame.
+        device: Device that each worker selects; several GPUs are assigned in turn. None for work without a device.
+        environment: Further environment variables of workers.
+        prepare: Function that each helper calls once.
+        threads: Number of threads that Dr.Jit uses in a worker on a CPU; None for its default.
     """
 
     def __init__(

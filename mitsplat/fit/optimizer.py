@@ -32,7 +32,13 @@ _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-15
 
 
 class BandRates(NamedTuple):
-    """Learning rates of the constant SH coefficients and of the others, and the number of coefficients per channel."""
+    """Learning rates of SH coefficients.
+
+    Attributes:
+        constant: Rate of the constant coefficients.
+        rest: Rate of the others.
+        bands: Number of coefficients per channel.
+    """
 
     constant: float
     rest: float

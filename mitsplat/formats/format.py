@@ -125,10 +125,13 @@ def _draw_entries(scene: Scene) -> list[JsonObject]:
 
 @dataclass(frozen=True, eq=False)
 class FrameFiles:
-    """Files of one frame below ``root``; ``record`` is its line of the manifest, which lists them.
+    """Files of one frame.
 
     Attributes:
+        root: Dataset folder.
         frame: Frame to write.
+        catalogue: Classes, keypoints and assets that labels refer to.
+        record: Line of the frame in the manifest, which lists the files.
         image: File of the frame's picture, relative to the root; it is written before any other file.
         ids: Instance ids of the label source, shape (H, W). Instances without a label are included, distractors are
             not.

@@ -82,7 +82,12 @@ CPU = Device("cpu")
 
 
 class MissingPrerequisite(NamedTuple):
-    """Missing prerequisite of a GPU (continues "because ..."), and its remedy."""
+    """Missing prerequisite of a GPU.
+
+    Attributes:
+        what: The prerequisite, as the rest of "because ...".
+        remedy: Recommended action.
+    """
 
     what: str
     remedy: str

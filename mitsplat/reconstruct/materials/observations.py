@@ -27,7 +27,14 @@ _MIN_OPENNESS, _MIN_FLATNESS = 0.9, 0.97
 
 
 class View(NamedTuple):
-    """Linear radiance of a photo, and its pixels that show only the object, or only other objects."""
+    """Linear radiance of a photo, and its pixels that show only the object, or only other objects.
+
+    Attributes:
+        camera: Camera of the pixels.
+        radiance: Linear radiance, (H, W, 3).
+        object: True for pixels that show only the object, (H, W).
+        surroundings: True for known pixels that show only other objects, (H, W).
+    """
 
     camera: Camera
     radiance: Float32Array

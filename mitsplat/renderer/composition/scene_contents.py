@@ -21,7 +21,20 @@ from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, merg
 
 @dataclass(frozen=True, eq=False)
 class SceneContents:
-    """Device data of all shapes of a scene that emit no light; reused while these shapes stay the same."""
+    """Device data of all shapes of a scene that emit no light; reused while these shapes stay the same.
+
+    Attributes:
+        shapes: The shapes.
+        clouds: Gaussians of the shapes ``splats``; None if there are none.
+        placements: Poses and instances of these clouds.
+        proxies: Proxy meshes and visible meshes, as surfaces that rays hit.
+        meshes: Visible meshes; None if there are none.
+        mirror: Splats as path-traced meshes reflect them; None if no mesh is path traced.
+        traits: Parameters of the light on each shape.
+        grid: Captured colours of the surroundings, for light that they reflect; None without surroundings.
+        mixed: Objects with metal and plastic, whose borders are blended; None if there are none.
+        normal_mapped: Shapes with normals finer than their proxy meshes; None if there are none.
+    """
 
     shapes: tuple[mi.Shape, ...]
     clouds: CloudSet | None

@@ -63,7 +63,17 @@ class Emitters:
     A sky of one colour is sampled by the cosine to the normal, so that only occlusion causes noise. An environment map
     is sampled half by the cosine and half by its radiance, with the balance heuristic (Veach 1997, section 9.2.2).
 
-    The attribute ``fluence`` is the light of all directions at the reference point, mean over channels [W/m^2].
+    Attributes:
+        fluence: Light of all directions at the reference point, mean over channels [W/m^2].
+        sky_reach: Distance beyond which nothing occludes the sky [m].
+        pointers: All emitters.
+        sky: Index of the sky among them; None without a sky.
+        even_sky: True if the sky has one colour.
+        sky_colour: This colour; None for another sky.
+        infinite: 1 for emitters at infinite distance, else 0.
+        choice: Probabilities of the emitters in :meth:`sample`.
+        local_choice: The same without the sky; None if there is no other emitter.
+        rectangles: Area lights in closed form; None unless all emitters besides the sky are rectangles.
     """
 
     def __init__(self, scene: mi.Scene, reference: Sequence[float], sky_reach: float = np.inf) -> None:

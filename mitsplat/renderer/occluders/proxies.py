@@ -211,7 +211,16 @@ class Proxies:
 
 @dataclass(frozen=True, eq=False)
 class TraceScene:
-    """All meshes merged into one (or None), with the instance id of every triangle, and visible shapes."""
+    """Scene that rays are traced against: all proxy meshes merged into one, and visible shapes.
+
+    Attributes:
+        scene: Mitsuba scene of both.
+        mesh: The merged proxy mesh; None if there is no proxy.
+        instances: Instance id of each proxy triangle.
+        corners: Positions of the corners of each proxy triangle [m], nine floats.
+        normals: Normals at these corners, nine floats.
+        materials: Materials at these corners; None if there is no proxy.
+    """
 
     scene: mi.Scene
     mesh: mi.ShapePtr | None

@@ -88,7 +88,14 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class CloudSet:
-    """Several clouds in one set of device arrays, so that one kernel serves all placements of a scene."""
+    """Several clouds in one set of device arrays, so that one kernel serves all placements of a scene.
+
+    Attributes:
+        counts: Number of Gaussians of each cloud.
+        first: Number of the first Gaussian of each cloud.
+        geometry, scales, sh: Rows of all clouds, as in :class:`Cloud`.
+        sh_count, sh_stride: The largest values of the clouds, as in :class:`Cloud`.
+    """
 
     counts: tuple[int, ...]
     first: tuple[int, ...]

@@ -74,7 +74,16 @@ class _Bounds:
 
 
 class Projector:
-    """Input of the projection kernels; ``changed`` is True if any placement has an appearance."""
+    """Projection of Gaussians to a view.
+
+    Args:
+        clouds: Gaussians on the device.
+        table: Rows of :class:`PlacementRow`, flat.
+        view: The camera.
+        quality: Kernel, response and cut-off of the opacity.
+        at_camera: True if Gaussians that reach the camera's plane are visible.
+        changed: True if any placement has an appearance.
+    """
 
     def __init__(
         self,

@@ -31,6 +31,8 @@ class Lanes:
         inside: True if the pixel is in the image.
         count: Number of all pixels.
         start, stop: Range of the tile's list.
+        x, y: Column and row of the lane's first pixel.
+        view, rows: The camera, and the number of pixels of a lane.
     """
 
     def __init__(self, lists: TileLists, view: CameraView, rows: int = TILE_HEIGHT, *, by_tile: bool = False) -> None:

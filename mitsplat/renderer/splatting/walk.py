@@ -119,7 +119,13 @@ def max_of(values: Sequence[mi.Float]) -> mi.Float:
 
 @dataclass(frozen=True, eq=False)
 class FieldsOnAccess:
-    """Fields of records that are fetched on access, because the rays of a lane blend different records."""
+    """Fields of records that are fetched on access, because the rays of a lane blend different records.
+
+    Attributes:
+        records: View records, flat.
+        number: Number of the record of each lane.
+        mask: True for lanes that fetch a record.
+    """
 
     records: mi.Float
     number: mi.UInt32

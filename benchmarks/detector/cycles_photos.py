@@ -42,7 +42,7 @@ from shapely.geometry import MultiPoint
 # isort: on
 from benchmarks.detector.clutter import STEEL, Material, matt, metal
 from benchmarks.detector.interiors import Interior, interior
-from benchmarks.detector.workshop import PLASTIC, WOOD, annotation, settle_parts, write_labels
+from benchmarks.detector.workshop import PLASTIC, WOOD, annotation, check_labels, settle_parts, write_labels
 from benchmarks.record import ROOT, recording
 from mitsplat.bake.mesh_parts import MeshPart, read_parts
 from mitsplat.capture.lighting.panorama import unit_vector
@@ -107,6 +107,8 @@ def photograph_benches(options: argparse.Namespace) -> None:
     inputs, photos = options.work / "cycles_inputs", options.work / "cycles"
     inputs.mkdir(parents=True, exist_ok=True)
     photos.mkdir(exist_ok=True)
+    made = {"made_by": "cycles_photos", "samples": options.samples, "width": options.width}
+    check_labels(photos, made)
     write_parts(inputs)
     for number in range(options.scenes):
         if not (inputs / f"scene_{number:04d}.json").exists():
@@ -120,7 +122,7 @@ def photograph_benches(options: argparse.Namespace) -> None:
         if failed := [k for k, job in enumerate(jobs) if job.wait()]:
             raise SystemExit(f"Blender failed in processes {failed} of {options.processes}")
     shots = [shot for path in sorted(inputs.glob("scene_*.json")) for shot in label_scene(path, photos)]
-    write_labels(photos, sorted(PARTS), shots)
+    write_labels(photos, sorted(PARTS), shots, made)
 
 
 def write_parts(inputs: Path, names: Iterable[str] = PARTS) -> None:

@@ -20,6 +20,7 @@ import hashlib
 import json
 import re
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from io import StringIO
@@ -113,6 +114,27 @@ def folds_of(plan: Mapping[str, Any], arm: str) -> list[set[int]]:
 def photos_of(plan: Mapping[str, Any]) -> str:
     """Return the folder of WORK with a plan's photographs."""
     return str(plan.get("photos", "photos"))
+
+
+def check_photographs(work: Path, plan: Mapping[str, Any]) -> None:
+    """Refuse photographs that are not those of a plan, because scores of different photographs are not comparable.
+
+    Raises:
+        SystemExit: If their maker, their quality, their scenes or the number of views differs from what the plan states
+            in ``photographs``. Plans without this key are not checked.
+    """
+    wanted, path = plan.get("photographs"), work / photos_of(plan) / "labels.json"
+    if wanted is None:
+        return
+    labels = json.loads(path.read_text())
+    made = labels.get("info", {})
+    views = Counter(scene_of(image["file_name"]) for image in labels["images"])
+    scenes = sorted(wanted.get("scenes", set().union(*map(set, plan["folds"]))))
+    found = [(key, made.get(key), wanted[key]) for key in ("made_by", "samples", "width")]
+    found += [("scenes", sorted(views), scenes), ("views", sorted(set(views.values())), [wanted["views"]])]
+    for key, got, expected in found:
+        if got != expected:
+            raise SystemExit(f"{path}: {key} must be {expected}, as in the plan (got {got}): use the WORK of the plan")
 
 
 def scene_of(image: str) -> int:
@@ -251,6 +273,7 @@ def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int
     settings = TrainSettings(**given, seed=options.seed, device=options.device, workers=options.workers)
     real = None
     if arm.get("real"):
+        check_photographs(work, plan)
         folds = folds_of(plan, options.arm)
         real = photographs(work, set().union(*folds) - folds[number], f"without_fold_{number}", photos_of(plan))
     run = work / "runs" / f"{options.arm}-{options.seed}-{number}"
@@ -261,6 +284,7 @@ def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int
 def measure(options: argparse.Namespace) -> None:
     """Train an arm for all folds, and evaluate it."""
     plan, work = read_arms(options.plan), options.work
+    check_photographs(work, plan)
     folds = folds_of(plan, options.arm)
     everything = photographs(work, set().union(*folds), "all_photos", photos_of(plan))
     size = plan["arms"][options.arm].get("test_size", plan["test_size"])

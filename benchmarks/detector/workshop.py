@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,8 @@ def photograph_workshops(options: argparse.Namespace) -> None:
     """Render the photographs of all scenes that are missing, and write the labels of all."""
     photos, assets = options.work / options.photos, options.work / "assets"
     photos.mkdir(parents=True, exist_ok=True)
+    made = {"made_by": "workshop", "samples": options.samples, "width": options.width}
+    check_labels(photos, made)
     if not assets.exists():
         shutil.copytree(ROOT / "scenes/assets", assets)
     names = sorted(path.parent.name for path in assets.glob("*/asset.yaml") if path.parent.name != "workcell")
@@ -82,18 +84,30 @@ def photograph_workshops(options: argparse.Namespace) -> None:
         if not stored.exists():
             stored.write_text(json.dumps(photograph_workshop(number, names, options)))
         shots += json.loads(stored.read_text())
-    write_labels(photos, names, shots)
+    write_labels(photos, names, shots, made)
 
 
-def write_labels(photos: Path, names: Sequence[str], shots: Sequence[dict[str, Any]]) -> None:
-    """Write the COCO file of photographs, and record their number and that of their labels."""
+def check_labels(photos: Path, made: Mapping[str, Any]) -> None:
+    """Refuse a folder with photographs that were made in another way.
+
+    Raises:
+        SystemExit: If its labels state another maker or another quality than ``made``.
+    """
+    labels = photos / "labels.json"
+    stated = json.loads(labels.read_text()).get("info", made) if labels.exists() else made
+    if stated != made:
+        raise SystemExit(f"{labels}: its photographs are of {stated}, and not of {dict(made)}: use another folder")
+
+
+def write_labels(photos: Path, names: Sequence[str], shots: Sequence[dict[str, Any]], made: Mapping[str, Any]) -> None:
+    """Write the COCO file of photographs with how they were ``made``, and record the numbers of images and labels."""
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for image, shot in enumerate(shots):
         images.append({"id": image, **shot["image"]})
         annotations += [{"id": len(annotations) + k, "image_id": image, **one} for k, one in enumerate(shot["objects"])]
     categories = [{"id": k, "name": name} for k, name in enumerate(names, 1)]
-    labels = {"images": images, "annotations": annotations, "categories": categories}
+    labels = {"info": dict(made), "images": images, "annotations": annotations, "categories": categories}
     (photos / "labels.json").write_text(json.dumps(labels))
     figure(len(images), "", "photographs")
     figure(len(annotations), "", "labelled parts")

@@ -246,6 +246,50 @@ def test_labels_of_workshop_photographs_are_the_visible_pixels(tmp_path, physics
     assert experiment.scene_of(labels["images"][1]["file_name"]) == 1
 
 
+MADE = {"made_by": "workshop", "samples": 64, "width": 960}
+
+
+@pytest.mark.parametrize(
+    ("plan", "made", "scenes", "views", "fault"),
+    [
+        ("workshop.yaml", MADE, range(10), 5, None),
+        ("development.yaml", MADE, range(10, 20), 5, None),
+        ("cycles.yaml", MADE | {"made_by": "cycles_photos", "samples": 12}, [*range(4), *range(8, 12)], 4, None),
+        ("cycles_96.yaml", MADE | {"made_by": "cycles_photos"}, range(12), 8, None),
+        ("workshop.yaml", MADE, range(10, 20), 5, "scenes must be [0, "),
+        ("workshop.yaml", MADE, range(9), 5, "scenes must be [0, "),
+        ("development.yaml", MADE, range(10), 5, "scenes must be [10, "),
+        ("cycles.yaml", MADE, range(12), 5, "made_by must be cycles_photos, as in the plan (got workshop)"),
+        ("cycles_96.yaml", MADE | {"made_by": "cycles_photos", "samples": 12}, range(12), 8, "samples must be 64"),
+        ("cycles_96.yaml", MADE | {"made_by": "cycles_photos"}, range(12), 4, "views must be [8]"),
+        ("workshop.yaml", MADE | {"width": 480}, range(10), 5, "width must be 960"),
+        ("workshop.yaml", None, range(10), 5, "made_by must be workshop, as in the plan (got None)"),
+    ],
+)
+def test_photographs_of_another_plan_are_refused(tmp_path, plan, made, scenes, views, fault):
+    arms = experiment.read_arms(Path(plan))
+    folder = tmp_path / experiment.photos_of(arms)
+    folder.mkdir()
+    names = [f"scene_{scene:04d}_{view:04d}.jpg" for scene in scenes for view in range(views)]
+    labels = {"images": [{"file_name": name} for name in names]} | ({} if made is None else {"info": made})
+    (folder / "labels.json").write_text(json.dumps(labels))
+    if fault is None:
+        experiment.check_photographs(tmp_path, arms)
+        return
+    with pytest.raises(SystemExit, match="use the WORK of the plan") as raised:
+        experiment.check_photographs(tmp_path, arms)
+    assert fault in str(raised.value) and str(folder) in str(raised.value)
+
+
+def test_a_folder_keeps_photographs_of_one_kind(tmp_path, monkeypatch):
+    monkeypatch.setattr(record, "_open", [{}])
+    workshop.check_labels(tmp_path, MADE)
+    workshop.write_labels(tmp_path, ["nut"], [], MADE)
+    workshop.check_labels(tmp_path, MADE)
+    with pytest.raises(SystemExit, match=r"'samples': 64, .* use another folder"):
+        workshop.check_labels(tmp_path, MADE | {"samples": 12})
+
+
 def test_a_brand_has_the_hues_of_its_scan():
     scan = make_package(1)  # a can
     own, others = (relabel(scan, 5, 2, own_colours=own) for own in (True, False))

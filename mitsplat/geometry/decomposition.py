@@ -19,6 +19,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from mitsplat.arrays import Float64Array
+from mitsplat.geometry.hull_fit import fit_to_hull
 from mitsplat.geometry.mesh import SHARP, contact_points, simplify_solid
 from mitsplat.geometry.mesh_distance import DistanceSurface, max_outside_distance
 from mitsplat.storage.cache import cache_folder, write_cache_file
@@ -70,7 +71,8 @@ def convex_pieces(
     3D Meshes with Collision-Aware Concavity and Tree Search*, 2022), whose search would take minutes for scans. Scans
     are cut by the planes that remove most empty volume from the convex hulls. Cutting ends when the gap between pieces
     and surface is acceptable for layouts, or at the maximum number of pieces.
-    :func:`mitsplat.geometry.mesh_distance.standoff` measures the gap. The result is cached in memory and in
+    :func:`mitsplat.geometry.mesh_distance.standoff` measures the gap. The pieces of a closed part get its convex
+    hull (:func:`mitsplat.geometry.hull_fit.fit_to_hull`). The result is cached in memory and in
     ``$XDG_CACHE_HOME/mitsplat/pieces`` (``~/.cache`` by default) by the hash of the mesh.
 
     Args:
@@ -86,14 +88,14 @@ def convex_pieces(
 
 @lru_cache(maxsize=256)
 def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, max_pieces: int) -> tuple[trimesh.Trimesh, ...]:
-    digest = ContentHash("pieces 5", f"{version('coacd')} {threshold!r} {max_pieces}", vertices, faces)
+    digest = ContentHash("pieces 6", f"{version('coacd')} {threshold!r} {max_pieces}", vertices, faces)
     path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:
         mesh = trimesh.Trimesh(
             np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, dtype=np.int64).reshape(-1, 3), process=False
         )
-        pieces = tuple(piece for part in _parts(mesh) for piece in _split(part, threshold, max_pieces))
+        pieces = tuple(piece for part in _parts(mesh) for piece in _fit(_split(part, threshold, max_pieces), part))
         _write_pieces(path, pieces)
     return pieces
 
@@ -134,6 +136,11 @@ def _split(part: trimesh.Trimesh, threshold: float, max_pieces: int) -> list[tri
     pieces = [trimesh.Trimesh(vertices, faces, process=False).convex_hull for vertices, faces in found]
     # Slivers add no contact to those of their neighbours and have no hull in single precision.
     return [piece for piece in pieces if piece.volume > 1e-6 * hull.volume]
+
+
+def _fit(pieces: Sequence[trimesh.Trimesh], part: trimesh.Trimesh) -> Sequence[trimesh.Trimesh]:
+    """Give the pieces of a closed solid its convex hull. CoACD's pieces of an open surface are thicker than it."""
+    return fit_to_hull(pieces, part, reach=max_gap(float(part.extents.max()))) if part.is_volume else pieces
 
 
 def _concave_edge_share(mesh: trimesh.Trimesh) -> float:

@@ -35,6 +35,7 @@ _PHYSICS_MODULES = (
 )
 MODULES = (
     "geometry.decomposition",
+    "geometry.hull_fit",
     "geometry.mesh",
     "geometry.mesh_distance",
     *(f"physics.{name}" for name in _PHYSICS_MODULES),

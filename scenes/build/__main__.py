@@ -17,6 +17,7 @@ import numpy as np
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.hull_fit import fit_to_hull
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.storage.yaml_input import load_yaml
@@ -38,7 +39,10 @@ def bake_part(name: str, seed: int) -> BakeResult:
         pieces=pieces,
         settings=BakeSettings(gaussians=16000, seed=seed),
     )
-    return replace(result, asset=replace(result.asset, restitution=0.6))
+    asset = result.asset
+    if asset.mesh is None:
+        raise ValueError(f"a baked object must have a mesh (got none for {name!r})")
+    return replace(result, asset=replace(asset, pieces=fit_to_hull(pieces, asset.mesh), restitution=0.6))
 
 
 def bake_environment(seed: int) -> BakeResult:

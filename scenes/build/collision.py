@@ -1,4 +1,7 @@
-"""Convex pieces of the parts for physics, in the millimetres and frames of :mod:`scenes.build.parts`."""
+"""Convex pieces of the parts for physics, in the millimetres and frames of :mod:`scenes.build.parts`.
+
+They omit threads and fillets. :func:`mitsplat.geometry.hull_fit.fit_to_hull` gives them the convex hull of the mesh.
+"""
 
 from __future__ import annotations
 

@@ -72,8 +72,9 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part with its convex pieces, and the local axis that tells flat from on edge."""
+    """A part with its mesh and convex pieces, and the local axis that tells flat from on edge."""
 
+    mesh: trimesh.Trimesh
     pieces: tuple[trimesh.Trimesh, ...]
     mass: MassProperties
     axis: Float64Array
@@ -93,7 +94,7 @@ def make_part(name: str) -> Part:
             mesh = trimesh.creation.cylinder(
                 radius=DIAMETER / 2, height=float(name.split()[1]) * DIAMETER, sections=128
             )
-        return Part((mesh,), mass_properties(mesh, (mesh,), density=7850.0), np.array([0.0, 0.0, 1.0]))
+        return Part(mesh, (mesh,), mass_properties(mesh, (mesh,), density=7850.0), np.array([0.0, 0.0, 1.0]))
     asset = Asset.load(ASSETS / name)
     if asset.mesh is None:
         raise ValueError(f"asset {name!r} must have a mesh (got none)")
@@ -102,7 +103,7 @@ def make_part(name: str) -> Part:
     gaps = np.diff(moments)
     round_part = gaps.min() < 0.01 * moments.max()
     axis = axes[:, 2 if gaps[1] > gaps[0] else 0] if round_part else np.array([0.0, 0.0, 1.0])
-    return Part(asset.pieces, mass, axis)
+    return Part(asset.mesh, asset.pieces, mass, axis)
 
 
 def draw_starts(batch: Batch) -> Float64Array:
@@ -115,12 +116,19 @@ def draw_starts(batch: Batch) -> Float64Array:
     return poses
 
 
-def drop_batch(batch: Batch) -> tuple[Batch, Float64Array, float, int]:
-    """Return the batch, the upward components of the bodies' axes (20, 3), CPU seconds, and the bodies that moved."""
+def drop_batch(batch: Batch) -> tuple[Batch, Float64Array, Float64Array, float, int]:
+    """Drop the bodies of a batch.
+
+    Returns:
+        The batch, the upward components of the bodies' axes (20, 3), the heights of the lowest points of their meshes
+        above the table (20,) [m], CPU seconds, and the number of bodies that moved.
+    """
     start = time.process_time()
     with warp_settings():
-        rotations, moving = (drop_reference if batch.stepper == "reference" else drop_bodies)(batch)
-    return batch, rotations[:, 2], time.process_time() - start, moving
+        poses, moving = (drop_reference if batch.stepper == "reference" else drop_bodies)(batch)
+    seconds = time.process_time() - start
+    heights = (poses[:, 2, :3] @ make_part(batch.part).mesh.vertices.T).min(axis=1) + poses[:, 2, 3]
+    return batch, poses[:, 2, :3], heights, seconds, moving
 
 
 @lru_cache(maxsize=1)
@@ -143,7 +151,7 @@ def drop_bodies(batch: Batch) -> tuple[Float64Array, int]:
     world = make_world(batch.part, batch.stepper, batch.restitution)
     world.reset(draw_starts(batch))
     outcome = run_to_rest(world, max_time=MAX_TIME, bounds=(np.full(3, -50.0), np.full(3, 50.0)), free_time=FREE_TIME)
-    return outcome.poses[:, :3, :3], len(outcome.causes)
+    return outcome.poses, len(outcome.causes)
 
 
 def damping_ratio(restitution: float) -> float:
@@ -187,7 +195,9 @@ def drop_reference(batch: Batch) -> tuple[Float64Array, int]:
     coordinates[:, :3] = starts[:, :3, 3]
     coordinates[:, 3:] = Rotation.from_matrix(starts[:, :3, :3]).as_quat(scalar_first=True)
     mujoco.mj_step(model, data, nstep=round(REFERENCE_TIME / REFERENCE_STEP))
-    found = Rotation.from_quat(coordinates[:, 3:], scalar_first=True).as_matrix()
+    found = np.tile(np.eye(4), (BATCH, 1, 1))
+    found[:, :3, :3] = Rotation.from_quat(coordinates[:, 3:], scalar_first=True).as_matrix()
+    found[:, :3, 3] = coordinates[:, :3]
     return found, int((np.abs(data.qvel.reshape(-1, 6)[:, :3]).max(axis=1) > 0.05).sum())
 
 
@@ -198,7 +208,13 @@ def batches_of(names: Sequence[str], steppers: Sequence[str], drops: int, restit
                 yield Batch(part, stepper, restitution, number)
 
 
-def show(name: str, up: dict[str, Float64Array], seconds: dict[str, float], moving: dict[str, int]) -> None:
+def show(
+    name: str,
+    up: dict[str, Float64Array],
+    heights: dict[str, Float64Array],
+    seconds: dict[str, float],
+    moving: dict[str, int],
+) -> None:
     """Print and record the shares of one part with each stepper of ``up``."""
     axis, table = make_part(name).axis, {}
     for stepper in up:
@@ -215,6 +231,7 @@ def show(name: str, up: dict[str, Float64Array], seconds: dict[str, float], movi
             (edge / count, "", "edge"),
             ((interval.low, interval.high), "", "edge interval"),
             (moving[stepper], "", "moving"),
+            ((1e3 * heights[stepper].min(), 1e3 * heights[stepper].max()), "mm", "heights of meshes"),
             (each, "s", "cpu"),
         ):
             figure(value, unit, name, stepper, what)
@@ -223,6 +240,7 @@ def show(name: str, up: dict[str, Float64Array], seconds: dict[str, float], movi
             counts = np.bincount(faces, minlength=6)
             figure(chisquare(counts).pvalue, "", name, stepper, "p of equal faces")
             text += f"  faces {counts.tolist()}, p = {chisquare(counts).pvalue:.3f}"
+        text += f"  mesh {1e3 * heights[stepper].min():.3f} to {1e3 * heights[stepper].max():.3f} mm above the table"
         print(f"{text}  moving {moving[stepper]}  {each:.3f} CPU s", flush=True)
     for first, second in combinations(up, 2):
         rows = np.array([table[first], table[second]])
@@ -250,21 +268,24 @@ def main() -> None:
     arguments = parser.parse_args()
     names = arguments.parts or part_names()
     up: dict[tuple[str, str], list[Float64Array]] = defaultdict(list)
+    heights: dict[tuple[str, str], list[Float64Array]] = defaultdict(list)
     seconds: dict[tuple[str, str], float] = defaultdict(float)
     moving: dict[tuple[str, str], int] = defaultdict(int)
     with recording("physics.drops", parser, arguments, ignore=("processes",)):
         drop_batch(Batch(names[0], arguments.steppers[0], arguments.restitution, 0))  # compiles the kernels once
         with ProcessPoolExecutor(arguments.processes, mp_context=get_context("spawn")) as pool:
             batches = batches_of(names, arguments.steppers, arguments.drops, arguments.restitution)
-            for batch, found, spent, moved in pool.map(drop_batch, batches, chunksize=CHUNK):
+            for batch, found, above, spent, moved in pool.map(drop_batch, batches, chunksize=CHUNK):
                 key = batch.part, batch.stepper
                 up[key].append(found)
+                heights[key].append(above)
                 seconds[key] += spent
                 moving[key] += moved
         for name in names:
             show(
                 name,
                 {stepper: np.concatenate(up[name, stepper]) for stepper in arguments.steppers},
+                {stepper: np.concatenate(heights[name, stepper]) for stepper in arguments.steppers},
                 {stepper: seconds[name, stepper] for stepper in arguments.steppers},
                 {stepper: moving[name, stepper] for stepper in arguments.steppers},
             )

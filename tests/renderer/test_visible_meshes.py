@@ -164,6 +164,9 @@ def test_a_mirror_reflects_the_splats_above_it() -> None:
     # The mirrored edge is at 0.15 / 2.5 of the distance to the ceiling's image: pixel 16 + 0.06 / 0.011 = 21.4.
     assert seen.rgb[4:28, 26:30].mean() == pytest.approx(high, rel=0.05)
     assert np.abs(seen.rgb[16, 18] - low).max() < 0.1 and np.abs(seen.rgb[16, 25] - high).max() < 0.1
+    # Labels are those of the mirror, not of its image.
+    np.testing.assert_allclose(seen.depth, 1.0, atol=1e-6)
+    np.testing.assert_allclose(seen.normal, np.broadcast_to([0, 0, 1], seen.normal.shape), atol=1e-6)
 
 
 def test_uniform_splats_are_relit_in_a_mirror() -> None:

@@ -39,6 +39,7 @@ from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.ksplat_files import read_ksplat
 from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_checks import check_colour_space, check_encoding, colours_differ
 from mitsplat.gaussians.splat_converter import convert_splats
 from mitsplat.gaussians.splat_training import (
     SPZ_ANTIALIASED,
@@ -66,11 +67,15 @@ _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 MAX_PLY_HEADER = 1 << 16
 _MEANS, _QUATS, _SCALES = ("x", "y", "z"), ("rot_1", "rot_2", "rot_3", "rot_0"), ("scale_0", "scale_1", "scale_2")
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
+_CHUNK_COLUMNS = 12
+"""Columns of the chunks of compressed PLY files without ranges of colours."""
+_COLOUR_RANGES = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
 _FLAT_THICKNESS = np.float32(0.01)
 """Third scale of flat Gaussians that have none, relative to the smaller of the others."""
 _FILTER = "filter_3D"
 _USED = re.compile(rf"[xyz]|f_dc_[012]|f_rest_\d+|opacity|scale_[012]|rot_[0123]|{_FILTER}")
-_REDUNDANT = ("nx", "ny", "nz", "red", "green", "blue")
+_COLOURS = ("red", "green", "blue")
+_REDUNDANT = ("nx", "ny", "nz", *_COLOURS)
 """Columns without further information: empty normals, and colours that repeat the SH coefficients of degree 0."""
 _MAX_COMPRESSION_RATIO = 100
 """Maximum ratio of decompressed to compressed size. Real files have ratios of 1.1 to 3."""
@@ -86,12 +91,6 @@ _SPZ_FRACTIONAL_BITS = 12
 _SPZ_FRACTIONAL_BITS_OFFSET = 13
 _SPZ_POSITION_BITS = 23
 
-_MIN_JUDGED = 100
-"""Number of Gaussians from which their values show how they are encoded."""
-_MIN_SPREAD = 0.7
-"""Range of stored opacities from which those from 0 to 1 are no logits."""
-_MAX_COEFFICIENT = 10.0
-"""Median of constant coefficients above which they are no colours: 1.8 is white."""
 _logger = logging.getLogger(__name__)
 
 
@@ -153,10 +152,14 @@ def read_splats(path: Path) -> tuple[SplatArrays, KernelName | None]:
         if suffix == ".ksplat":
             return _decode_ksplat(data), None
         arrays, names = _decode_ply(data), _vertex_names(data)
+        other_colours = _has_other_colours(data, names)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
     if unused := [name for name in names if name not in _REDUNDANT and not _USED.fullmatch(name)]:
         _logger.warning("%s: the columns %s are not used", path, ", ".join(unused))
+    if other_colours:
+        rule = "%s: its columns red, green, blue differ from its coefficients f_dc_0 to f_dc_2, which are used"
+        _logger.warning(rule, path)
     stated = ply_kernel(data[:MAX_PLY_HEADER].partition(b"end_header")[0])
     implied: KernelName | None = "mip" if _FILTER in names else "exact" if names and _SCALES[2] not in names else None
     return arrays, stated or implied
@@ -201,17 +204,20 @@ def _decode_ply(data: bytes) -> SplatArrays:
         raise InputError("a PLY file of splats must have a vertex element")
     names = elements["vertex"][1].names or ()
     if "packed_position" in names:
-        return _decode_ply(_convert(data, "compressed.ply", "ply"))
+        return _decode_ply(_convert(_with_colour_ranges(data, form, elements, start), "compressed.ply", "ply"))
     scale_names = _SCALES if _SCALES[2] in names else _SCALES[:2]  # 2DGS has two
     missing = [n for n in (*_MEANS, *_COLOUR, "opacity", *scale_names, *_QUATS) if n not in names]
     if missing:
-        raise InputError(f"a PLY file of splats must have the vertex properties {', '.join(missing)} (missing)")
+        cause = ": export coefficients in place of red, green, blue" if {"red", "f_dc_0"} <= {*names, *missing} else ""
+        raise InputError(f"a PLY file of splats must have the vertex properties {', '.join(missing)} (missing){cause}")
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{i}" for i in range(rest)]
     if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
         raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
     rows = vertex_rows(data, form, elements, start)
-    _check_encoding(*(columns_of(rows, names) for names in (_MEANS, scale_names, ("opacity",), _COLOUR)))
+    check_encoding(*(columns_of(rows, names) for names in (_MEANS, scale_names, ("opacity",), _COLOUR)))
+    if form != "ascii":
+        check_colour_space(data, elements, start)
     scales, opacities = _exp(columns_of(rows, scale_names)), _sigmoid(rows["opacity"])
     if len(scale_names) == 2:
         scales = np.hstack([scales, _FLAT_THICKNESS * scales.min(axis=1, keepdims=True)])
@@ -231,6 +237,21 @@ def _decode_ply(data: bytes) -> SplatArrays:
     )
 
 
+def _with_colour_ranges(data: bytes, form: str, elements: dict[str, tuple[int, np.dtype[Any]]], start: int) -> bytes:
+    """Return a compressed PLY file with ranges of colours in its chunks. Early files have none, which means 0 to 1."""
+    count, row = elements.get("chunk", (0, np.dtype([])))
+    end = start + count * row.itemsize
+    is_early = next(iter(elements)) == "chunk" and len(row.names or ()) == _CHUNK_COLUMNS and form != "ascii"
+    if not is_early or row.itemsize != 4 * _CHUNK_COLUMNS or not len(data) >= end > start:
+        return data
+    ranges = np.frombuffer(data, row.descr[0][1], count * _CHUNK_COLUMNS, start).reshape(count, -1)
+    colours = np.broadcast_to(np.repeat([0.0, 1.0], 3).astype(ranges.dtype), (count, 6))
+    last = f"property float {(row.names or ())[-1]}\n"
+    head = data[:start].decode("ascii", "replace").replace("\r\n", "\n")
+    head = head.replace(last, last + "".join(f"property float {name}\n" for name in _COLOUR_RANGES))
+    return head.encode() + np.hstack([ranges, colours]).tobytes() + data[end:]
+
+
 def _decode_ksplat(data: bytes) -> SplatArrays:
     means, quats, scales, colours, sh = read_ksplat(data)
     constant = (colours[:, None, :3] - 0.5) / SH_C0
@@ -238,42 +259,18 @@ def _decode_ksplat(data: bytes) -> SplatArrays:
     return SplatArrays(*(values.astype(np.float32) for values in arrays))
 
 
-def _check_encoding(means: Float32Array, scales: Float32Array, opacities: Float32Array, colours: Float32Array) -> None:
-    """Refuse sizes, opacities and colours in place of the logarithms, logits and coefficients of a PLY file.
-
-    Trained splats have logits outside of 0 to 1, and most of their Gaussians are smaller than the cloud. A file is
-    refused in three cases:
-
-    * All logits lie in 0 to 1, and they cover this range or all Gaussians are larger than one unit.
-    * All Gaussians are larger than one unit, and most of them are as large as the cloud.
-    * The coefficients are as large as colours from 0 to 255.
-    """
-    if len(scales) < _MIN_JUDGED:
-        return
-    low, high = float(opacities.min()), float(opacities.max())
-    if 0 <= low <= high <= 1 and (scales.min() > 0 or high - low > _MIN_SPREAD):
-        raise InputError(
-            "scale_0 to scale_2 and opacity of a PLY file must be logarithms and logits (got "
-            f"{scales.min():.3g} to {scales.max():.3g}, and {low:.3g} to {high:.3g}): apply log "
-            "to the scales and log(o / (1 - o)) to the opacities"
-        )
-    extent = float(np.ptp(np.percentile(means, (5, 95), axis=0), axis=0).max())
-    if scales.min() > 0 and (size := float(np.exp(np.median(scales)))) > 0.5 * extent:
-        raise InputError(
-            f"scale_0 to scale_2 of a PLY file must be logarithms (got {scales.min():.3g} to {scales.max():.3g}, which "
-            f"are Gaussians of {size:.3g} units in a cloud of {extent:.3g} units): apply log to the scales"
-        )
-    if (usual := float(np.median(np.abs(colours)))) > _MAX_COEFFICIENT:
-        raise InputError(
-            "f_dc_0 to f_dc_2 of a PLY file must be coefficients of spherical harmonics (got values of "
-            f"{usual:.3g}): convert colours from 0 to 255 by (c / 255 - 0.5) / 0.2821"
-        )
-
-
 def _vertex_names(data: bytes) -> tuple[str, ...]:
     """Return the names of the columns of a PLY file of splats; none if they are packed."""
     names = parse_ply_header(data)[1]["vertex"][1].names or ()
     return () if "packed_position" in names else names
+
+
+def _has_other_colours(data: bytes, names: tuple[str, ...]) -> bool:
+    """Return True if a PLY file of splats has the columns red, green and blue, and they are not those of its f_dc."""
+    if not set(_COLOURS) <= set(names):
+        return False
+    rows = vertex_rows(data, *parse_ply_header(data))
+    return colours_differ(columns_of(rows, _COLOURS), columns_of(rows, _COLOUR))
 
 
 def parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[Any]]], int]:

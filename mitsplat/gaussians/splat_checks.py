@@ -1,0 +1,93 @@
+"""Checks of the values of splats in PLY files: logarithms, logits and coefficients, and contradictory colours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mitsplat.arrays import Float32Array
+from mitsplat.errors import InputError
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+
+_MIN_JUDGED = 100
+"""Number of Gaussians from which their values show how they are encoded."""
+_MIN_SPREAD = 0.7
+"""Range of stored opacities from which those from 0 to 1 are no logits."""
+_MAX_COEFFICIENT = 10.0
+"""Median of constant coefficients above which they are no colours: 1.8 is white."""
+_EQUAL_COLOURS = 6.0
+"""Median difference of colours from 0 to 255 above which they are other colours."""
+_COLOUR_SPACE = "color_space"
+"""Element of the files of SHARP (Apple): 0 for sRGB, 1 for linear colours."""
+
+
+def check_encoding(means: Float32Array, scales: Float32Array, opacities: Float32Array, colours: Float32Array) -> None:
+    """Refuse sizes, opacities and colours in place of the logarithms, logits and coefficients of a PLY file.
+
+    Trained splats have logits outside of 0 to 1, and most of their Gaussians are smaller than the cloud. A file is
+    refused in four cases:
+
+    * All logits lie in 0 to 1, and they cover this range or all Gaussians are larger than one unit.
+    * All Gaussians are larger than one unit, and most of them are as large as the cloud.
+    * The coefficients are as large as colours from 0 to 255.
+    * All opacities are whole numbers from 0 up, as of bytes or percent.
+    """
+    if len(scales) < _MIN_JUDGED:
+        return
+    low, high = float(opacities.min()), float(opacities.max())
+    if 0 <= low <= high <= 1 and (scales.min() > 0 or high - low > _MIN_SPREAD):
+        raise InputError(
+            "scale_0 to scale_2 and opacity of a PLY file must be logarithms and logits (got "
+            f"{scales.min():.3g} to {scales.max():.3g}, and {low:.3g} to {high:.3g}): apply log "
+            "to the scales and log(o / (1 - o)) to the opacities"
+        )
+    if low >= 0 and high > 1 and np.isfinite(high) and np.array_equal(opacities, np.rint(opacities)):
+        raise InputError(
+            f"opacity of a PLY file must be logits (got whole numbers from {low:.0f} to {high:.0f}): divide them by "
+            "their maximum (255 or 100), and apply log(o / (1 - o))"
+        )
+    extent = float(np.ptp(np.percentile(means, (5, 95), axis=0), axis=0).max())
+    if scales.min() > 0 and (size := float(np.exp(np.median(scales)))) > 0.5 * extent:
+        raise InputError(
+            f"scale_0 to scale_2 of a PLY file must be logarithms (got {scales.min():.3g} to {scales.max():.3g}, which "
+            f"are Gaussians of {size:.3g} units in a cloud of {extent:.3g} units): apply log to the scales"
+        )
+    if (usual := float(np.median(np.abs(colours)))) > _MAX_COEFFICIENT:
+        raise InputError(
+            "f_dc_0 to f_dc_2 of a PLY file must be coefficients of spherical harmonics (got values of "
+            f"{usual:.3g}): convert colours from 0 to 255 by (c / 255 - 0.5) / 0.2821"
+        )
+
+
+def check_colour_space(data: bytes, elements: Mapping[str, tuple[int, np.dtype[Any]]], start: int) -> None:
+    """Refuse a PLY file whose element ``color_space`` states linear colours.
+
+    Args:
+        data: The file.
+        elements: Numbers and row types of its elements, in their order.
+        start: Offset of the first row [bytes].
+
+    Raises:
+        InputError: If the value is not 0.
+    """
+    before = list(elements)[: list(elements).index(_COLOUR_SPACE)] if _COLOUR_SPACE in elements else []
+    if not before or any(elements[name][1].hasobject for name in (*before, _COLOUR_SPACE)):
+        return
+    kind = elements[_COLOUR_SPACE][1]
+    start += sum(count * row.itemsize for count, row in (elements[name] for name in before))
+    if len(data) < start + kind.itemsize:
+        return
+    value = np.frombuffer(data, kind, 1, start)[0]
+    if any(value[name] for name in kind.names or ()):
+        raise InputError(f"its colours must be sRGB (its element {_COLOUR_SPACE} is {value[0]}, linear): export sRGB")
+
+
+def colours_differ(colours: Float32Array, coefficients: Float32Array) -> bool:
+    """Return True if colours (N, 3), from 0 to 255 or to 1, are not those of constant coefficients (N, 3)."""
+    if not len(colours):
+        return False
+    scale = 1.0 if colours.max() > 1 else 255.0
+    expected = 255 * np.clip(0.5 + SH_C0 * coefficients.astype(np.float64), 0, 1)
+    return bool(np.median(np.abs(scale * colours - expected).max(axis=1)) > _EQUAL_COLOURS)

@@ -33,6 +33,7 @@ from mitsplat.errors import InputError, checks_arguments, path_of
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.geometry.untrusted_meshes import check_mesh
 from mitsplat.mesh_files.mesh_reading import SCENE_SUFFIXES, read_surface
 from mitsplat.storage.field_types import Name
@@ -301,7 +302,7 @@ class Asset:
             keypoints=dict(
                 zip(
                     self.keypoints,
-                    map(tuple, (self.keypoint_array @ matrix[:3, :3].T + matrix[:3, 3]).tolist()),
+                    map(tuple, transform_points(matrix, self.keypoint_array).tolist()),
                     strict=True,
                 )
             ),

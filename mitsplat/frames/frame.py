@@ -21,6 +21,7 @@ from mitsplat.frames.camera_response import Development, apply_light, start_deve
 from mitsplat.frames.light_properties import background_light, irradiance_of, light_properties, white_irradiance
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.images.masks import Silhouette
 from mitsplat.labels.flow import exposure_flow, instance_motions, optical_flow
 from mitsplat.labels.keypoint_visibility import find_blocked_keypoints
@@ -295,7 +296,7 @@ class Renderer:
         for one in layout.instances:
             mesh, pose = self.scene.assets[one.asset].mesh, one.world_from_object
             if mesh is not None:
-                corners = trimesh.bounds.corners(mesh.bounds) @ pose[:3, :3].T + pose[:3, 3]
+                corners = transform_points(pose, trimesh.bounds.corners(mesh.bounds))
                 boxes.append((corners.min(axis=0), corners.max(axis=0)))
         if not boxes or any(sees(plan.camera, low, high) for low, high in boxes):
             return

@@ -27,7 +27,7 @@ from mitsplat.geometry.lens import (
     lens_fault,
     undistort,
 )
-from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, points_of, rigid_matrix, split_similarity
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, points_of, rigid_matrix, split_similarity, transform_points
 from mitsplat.storage.files import JsonObject
 
 MAX_IMAGE_SIDE = 16384
@@ -285,8 +285,7 @@ class Camera:
         stops growing (or 85 degrees, for a fisheye lens) also has NaN, because its polynomial may place the point
         inside the image, where no ray shows it.
         """
-        pose = self.camera_from_world
-        local = points_of(points, "points") @ pose[:3, :3].T + pose[:3, 3]
+        local = transform_points(self.camera_from_world, points_of(points, "points"))
         depth = local[:, 2]
         front = depth > 0
         if not self.distortion:
@@ -381,8 +380,7 @@ class Camera:
         rays, depths = self.rays(pixels), np.reshape(depth, (-1, 1))
         if len(depths) != len(rays):
             raise InputError(f"depth must have one value for each pixel (got {len(depths)} for {len(rays)} pixels)")
-        local = rays * depths
-        return np.asarray(local @ self.world_from_camera[:3, :3].T + self.centre)
+        return transform_points(self.world_from_camera, rays * depths)
 
 
 def direction(azimuth: float, sine: float) -> Float64Array:

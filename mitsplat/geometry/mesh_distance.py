@@ -15,6 +15,7 @@ import warp as wp
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.geometry.mesh import contact_points, join_meshes
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.runtime.warp_start import quiet_warp
 
 _SAMPLES, _BATCH = 4000, 256
@@ -84,7 +85,7 @@ class PlacedSurface:
     def __init__(self, name: str, surface: DistanceSurface, world_from_surface: Float64Array | None = None) -> None:
         pose = np.eye(4) if world_from_surface is None else world_from_surface
         self.name = name
-        self.points = surface.points @ pose[:3, :3].T + pose[:3, 3]
+        self.points = transform_points(pose, surface.points)
         self.bounds = np.stack([self.points.min(axis=0), self.points.max(axis=0)])
         self.size = float(np.ptp(surface.points, axis=0).max())
         self._surface, self._pose = surface, pose

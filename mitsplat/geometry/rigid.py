@@ -1,4 +1,4 @@
-"""Rigid transforms given by users: validation, with the likely cause of a violation."""
+"""Transforms as matrices: checks of those given by users, with the likely cause of a violation, and their use."""
 
 from __future__ import annotations
 
@@ -96,6 +96,12 @@ def nearest_rigid(matrix: Float64Array) -> Float64Array:
     nearest = np.eye(4)
     nearest[:3, :3], nearest[:3, 3] = u @ vt, matrix[:3, 3]
     return nearest
+
+
+def transform_points(matrix: Float64Array, points: npt.NDArray[np.floating]) -> Float64Array:
+    """Return points (..., 3) after an affine transform (4, 4)."""
+    moved: Float64Array = points @ matrix[:3, :3].T + matrix[:3, 3]
+    return moved
 
 
 def points_of(value: npt.ArrayLike, place: str) -> Float64Array:

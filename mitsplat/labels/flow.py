@@ -8,6 +8,7 @@ import numpy as np
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, FloatingArray, IntegerArray
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt
 
@@ -47,7 +48,7 @@ def optical_flow(
         if motion is None:
             known &= ~mask
         else:
-            points[mask] = points[mask] @ motion[:3, :3].T + motion[:3, 3]
+            points[mask] = transform_points(motion, points[mask])
     if belt is not None:
         points[np.ravel(ids == 0) & belt.on_surface(points)] += belt.interval * belt.velocity
     next_pixels, next_depth = next_camera.project(points)

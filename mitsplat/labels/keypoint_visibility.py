@@ -16,6 +16,7 @@ import trimesh
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import transform_points
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Instance
@@ -72,7 +73,7 @@ def find_blocked_keypoints(
     if not shown:
         return {}
     poses = [(one.world_from_object, surface_keypoints(assets[one.asset])) for one in shown]
-    points = np.concatenate([local @ pose[:3, :3].T + pose[:3, 3] for pose, local in poses])
+    points = np.concatenate([transform_points(pose, local) for pose, local in poses])
     starts, ends = _keypoint_rays(points, camera)
     blocked = find_hits(starts.reshape(-1, 3), ends.reshape(-1, 3)).reshape(len(points), -1).all(axis=1)
     counts = np.cumsum([len(local) for _, local in poses])

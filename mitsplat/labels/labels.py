@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.errors import checks_arguments
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.images.masks import (
     BOUNDARY_TOLERANCE,
     Box,
@@ -391,7 +392,7 @@ def _project_keypoints(
     which may have no mesh.
     """
     pose = instance.world_from_object
-    points = points @ pose[:3, :3].T + pose[:3, 3]
+    points = transform_points(pose, points)
     pixels, depth = camera.project(points)
     hidden = np.zeros(len(points), dtype=bool) if blocked is None else blocked
     keypoints = np.zeros((len(points), 3))

@@ -22,7 +22,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
-from mitsplat.geometry.rigid import split_similarity
+from mitsplat.geometry.rigid import split_similarity, transform_points
 from mitsplat.renderer.layers import render_splats
 
 _OPAQUE = 0.9
@@ -149,7 +149,7 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array, scale: float | No
         found = _icp_steps(surface, points, start, np.repeat(widths[-1], _FINE_STEPS), scale is not None)
         finals.append((_misfit(surface, samples, points, found, missed), len(finals), found))
     _, _, mesh_from_splats = min(finals)
-    distance = surface.nearest(_transform_points(points, mesh_from_splats))[2]
+    distance = surface.nearest(transform_points(mesh_from_splats, points))[2]
     splats_from_mesh = np.asarray(np.linalg.inv(mesh_from_splats), dtype=np.float64)
     found_scale = float(np.cbrt(np.linalg.det(splats_from_mesh[:3, :3])))
     return Alignment(splats_from_mesh, found_scale, float(np.median(distance) / mesh.scale))
@@ -163,11 +163,6 @@ def measure_offset(mesh: trimesh.Trimesh, points: Float64Array) -> Offset:
     # The least-norm solution is zero in directions in which the surface can slide along itself.
     shift, *_ = np.linalg.lstsq(normal[near], gap[near], rcond=1e-3)
     return Offset(float(np.linalg.norm(shift) / mesh.scale), float(np.median(distance) / mesh.scale))
-
-
-def _transform_points(points: Float64Array, matrix: Float64Array) -> Float64Array:
-    moved: Float64Array = points @ matrix[:3, :3].T + matrix[:3, 3]
-    return moved
 
 
 def _size(points: Float64Array) -> float:
@@ -212,7 +207,7 @@ def _icp_steps(
     few farthest points show a wrong rotation.
     """
     for width in widths:
-        moved = _transform_points(points, matrix)
+        moved = transform_points(matrix, points)
         nearest, normal, distance = surface.nearest(moved)
         weight = (1 + (distance / width) ** 2) ** -2
         middle = moved.mean(axis=0)
@@ -246,6 +241,6 @@ def _misfit(
     All points count, because the few far points distinguish two poses of a nearly symmetric part. Distances are limited
     to ``missed``, because parts of the surface may be unseen.
     """
-    moved = _transform_points(points, matrix)
+    moved = transform_points(matrix, points)
     there, back = surface.nearest(moved)[2], KDTree(moved).query(samples)[0]
     return float(np.minimum(there, missed).mean() + np.minimum(back, missed).mean())

@@ -19,6 +19,7 @@ from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.capture.capture import Capture
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.progress import Progress
 from mitsplat.surroundings.coverage import MAX_THING_HEIGHT, SUPPORT_TOLERANCE
 from mitsplat.surroundings.depth_views import SurfacePoints, depth_views
@@ -175,7 +176,7 @@ def _remove_object(
         & (np.abs(others[:, 2] / (SUPPORT_TOLERANCE * scale) - 0.5) < _FEET_RANGE)
     )
     parts = np.concatenate([body, others[feet]]), others[~feet]
-    own, rest = (part @ support.pose[:3, :3].T + support.pose[:3, 3] for part in parts)
+    own, rest = (transform_points(support.pose, part) for part in parts)
     return left, own, rest, removed
 
 

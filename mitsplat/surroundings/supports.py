@@ -17,7 +17,7 @@ from scipy.ndimage import binary_closing, binary_opening, label
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.geometry.camera import direction
-from mitsplat.geometry.rigid import split_similarity
+from mitsplat.geometry.rigid import split_similarity, transform_points
 from mitsplat.importing.upright import POINTS, largest_plane, rotation_to_z
 from mitsplat.surroundings.depth_views import SurfacePoints
 
@@ -263,5 +263,5 @@ def flatten_mesh(mesh: trimesh.Trimesh, supports: Sequence[Support], margin: flo
     for support in supports:
         local, inside = support.local(vertices), support.contains(vertices, margin)
         local[inside, 2] = 0
-        vertices[inside] = local[inside] @ support.pose[:3, :3].T + support.pose[:3, 3]
+        vertices[inside] = transform_points(support.pose, local[inside])
     return trimesh.Trimesh(vertices, mesh.faces, process=False)

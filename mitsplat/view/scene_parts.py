@@ -21,6 +21,7 @@ from mitsplat.capture.capture import Capture
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.labels.overlay import class_colour
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import layout_at_view
@@ -302,7 +303,7 @@ def bounds_of(parts: Iterable[ShownPart]) -> Float64Array:
             points = part.drawable.splats.means if isinstance(part.drawable, ShownSplats) else part.drawable.points
             if len(points):
                 low, high = np.percentile(points, (2, 98), axis=0)
-                corners = _corners(low, high) @ part.pose[:3, :3].T + part.pose[:3, 3]
+                corners = transform_points(part.pose, _corners(low, high))
                 found += [corners.min(axis=0), corners.max(axis=0)]
     return np.array([np.min(found, axis=0), np.max(found, axis=0)]) if found else np.array([[-0.5] * 3, [0.5] * 3])
 

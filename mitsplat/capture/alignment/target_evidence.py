@@ -15,6 +15,7 @@ from mitsplat.capture.boards.targets import Board, find_tags
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.geometry.triangulation import triangulate
 from mitsplat.images.picture_files import read_picture
 
@@ -68,7 +69,7 @@ def board_evidence(model: SparseModel, views: TargetViews, board: Board) -> Fram
     if fitted is None:
         return None
     pose, factor = fitted
-    flat = board.corners / factor @ pose[:3, :3].T + pose[:3, 3]
+    flat = transform_points(pose, board.corners / factor)
     wrong, confirmed = _check_cameras(views, {**dict(enumerate(flat)), **corners})
 
     def board_scale(names: set[str]) -> float | None:
@@ -117,7 +118,7 @@ def fit_similarity(source: Float64Array, target: Float64Array) -> tuple[Float64A
         Matrix, shape (4, 4), and the residuals, shape (N, 3).
     """
     matrix = np.asarray(SimilarityTransform.from_estimate(source, target).params, dtype=np.float64)
-    return matrix, source @ matrix[:3, :3].T + matrix[:3, 3] - target
+    return matrix, transform_points(matrix, source) - target
 
 
 def find_targets(

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.capture.boards.targets import Board
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import transform_points
 
 _SAMPLES = 16
 """Samples along the edge of a square."""
@@ -87,7 +88,7 @@ def _board_points(board: Board, x: Float64Array, y: Float64Array) -> Float64Arra
 
 def _project_points(places: Float64Array, world_from_board: Float64Array, camera: Camera) -> Float64Array:
     """Return the pixel positions (..., 2) of points on the board (..., 3)."""
-    pixels, _ = camera.project(places.reshape(-1, 3) @ world_from_board[:3, :3].T + world_from_board[:3, 3])
+    pixels, _ = camera.project(transform_points(world_from_board, places.reshape(-1, 3)))
     return pixels.reshape(*places.shape[:-1], 2)
 
 

@@ -14,6 +14,7 @@ from scipy.ndimage import distance_transform_edt
 
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.images.colour import decode_srgb
 from mitsplat.renderer.rays.device_arrays import wrapped
 
@@ -43,7 +44,7 @@ class RadianceGrid:
         opaque = splats.opacities > 0.5
         if not opaque.any():
             return None
-        points = splats.means[opaque] @ world_from_splats[:3, :3].T + world_from_splats[:3, 3]
+        points = transform_points(world_from_splats, splats.means[opaque])
         encoded = np.clip(0.5 + SH_C0 * splats.sh[opaque, 0], 0.0, None)
         colours = decode_srgb(encoded)
         area = np.prod(np.sort(splats.scales[opaque], axis=1)[:, 1:], axis=1)

@@ -20,6 +20,7 @@ import trimesh
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_points import points_inside
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.storage.files import JsonObject
 
@@ -107,11 +108,9 @@ class VisibilityPredictor:
         step = 1 + sum(map(len, samples)) // _MAX_POINTS
         samples = [points[::step] for points in samples]
         poses = [one.world_from_object for one in instances]
-        placed = [points @ pose[:3, :3].T + pose[:3, 3] for points, pose in zip(samples, poses, strict=True)]
+        placed = [transform_points(pose, points) for points, pose in zip(samples, poses, strict=True)]
         meshes = [_mesh(scene, one.asset) for one in instances]
-        middles = [
-            mesh.bounds.mean(axis=0) @ pose[:3, :3].T + pose[:3, 3] for mesh, pose in zip(meshes, poses, strict=True)
-        ]
+        middles = [transform_points(pose, mesh.bounds.mean(axis=0)) for mesh, pose in zip(meshes, poses, strict=True)]
         self.centres: Float64Array = np.array(middles, dtype=np.float64).reshape(-1, 3)
         self._points: Float64Array = np.concatenate(placed) if placed else np.zeros((0, 3))
         self._counts = np.array([len(points) for points in placed], dtype=np.int64)

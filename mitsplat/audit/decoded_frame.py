@@ -17,7 +17,9 @@ from mitsplat.images.masks import Box, decode_rle
 from mitsplat.storage.files import JsonObject, Record
 
 _RANGE, _DISTORTED_RANGES = (1.0,), (1.0, 0.5, 0.25, 0.125, 0.0)
-"""Ranges around the image in which silhouettes are counted, in image sizes; that of a distorted lens is one of several.
+"""Possible margins around the image, in its width and height, in which the pixels of silhouettes are counted.
+
+A pinhole camera has one margin. A distorted lens has the largest of several margins in which its model can be inverted.
 """
 
 
@@ -36,7 +38,7 @@ class DecodedInstance:
         visible_fraction: Visible pixels over the pixels of the silhouette in the image.
         reaches_range: True if the silhouette reaches the end of the range in which its pixels are counted.
         truncation: Fraction of the silhouette beyond the image's border. For a silhouette that reaches the end of its
-            range, this is the fraction in the manifest, unless it is too small.
+            range, this is the fraction in the manifest if that is larger.
     """
 
     def __init__(self, entry: JsonObject, width: int, height: int, *, is_distorted: bool = False) -> None:
@@ -135,10 +137,10 @@ class DecodedFrame:
         return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
     def has_no_pixel(self, points: Float64Array) -> BoolArray:
-        """Return True for points in the camera's frame (N, 3) beyond the rays of the lens.
+        """Return True for points in the camera's frame (N, 3) that no pixel can show.
 
-        The distance from the principal point does not grow all the way from the axis to their ray, or a fisheye would
-        show more than 85 degrees.
+        With growing angle to the axis, the pixel of a ray must move away from the principal point. Rays are excluded
+        from the angle at which it first moves back. Rays of a fisheye lens are also excluded beyond 85 degrees.
         """
         slopes = points[:, :2] / points[:, 2:]
         beyond = np.zeros(len(points), dtype=bool)

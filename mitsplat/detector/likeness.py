@@ -333,7 +333,7 @@ def _significant(
 ) -> tuple[bool, bool]:
     """Return for each side True if the share outside is significant in a permutation test.
 
-    The test deals all images to the two sides at random. A share is significant if fewer than :data:`SIGNIFICANCE` of
+    The test assigns all images to the two sides at random. A share is significant if fewer than :data:`SIGNIFICANCE` of
     the permutations reach it. The objects of an image stay together because they share its light. The result is False
     for too few objects.
     """

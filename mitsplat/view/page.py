@@ -227,7 +227,10 @@ class Page:
         return max(float((middle - pose[:3, 3]) @ pose[:3, 2]), 0.05)
 
     def _pixel_size(self, part: ShownPart) -> float:
-        """Return the size of a pixel at the middle of a part [m] in the first view; without one, all of it is seen."""
+        """Return the size of a pixel [m] at the middle of a part in the first view.
+
+        Without a camera for the first view, the part fills the page.
+        """
         low, high = bounds_of([part])
         if self._start is None:
             return float(np.linalg.norm(high - low)) / _PANE_HEIGHT

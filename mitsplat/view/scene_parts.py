@@ -149,7 +149,7 @@ def share_gaussians(parts: Iterable[ShownPart], most: int) -> tuple[list[ShownPa
     """Return parts that draw at most ``most`` Gaussians together, and the number of all their Gaussians.
 
     All clouds draw the same share, because a browser sorts and draws the Gaussians of all clouds together. Shares are
-    powers of the root of one half, so that one object more or less seldom changes all clouds.
+    powers of the square root of 1/2, so that adding or removing one object seldom changes the share of all clouds.
     """
     parts = list(parts)
     count = sum(len(part.drawable.splats) for part in parts if isinstance(part.drawable, ShownSplats))

@@ -123,7 +123,7 @@ def _coco_files(root: Path, split: Split) -> dict[Path, JsonObject]:
 
 
 def _split_words(path: Path) -> list[str]:
-    """Return the words of a path, those of other tools' splits translated."""
+    """Return the words of a path; other names of a split, such as ``valid``, are replaced by the usual one."""
     return [_SPLIT_FOLDERS.get(word, word) for word in re.findall("[a-z]+", str(path.with_suffix("")).lower())]
 
 

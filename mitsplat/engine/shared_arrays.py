@@ -50,7 +50,7 @@ class SharedArrays(Generic[Value]):
             _logger.warning("%s: cannot be written (%s): workers share memory instead", cache_folder(), error)
             self._file = _write_parts(os.fdopen(os.memfd_create("mitsplat"), "w+b"), places)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return _open, (DupFd(self._file.fileno()), self.size)
 
     def close(self) -> None:

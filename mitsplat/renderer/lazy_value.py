@@ -16,7 +16,7 @@ class LazyValue:
     """
 
     @classmethod
-    def later(cls, makers: Mapping[str, Callable[[], Any]], **known: Any) -> Self:
+    def later(cls, makers: Mapping[str, Callable[[], object]], **known: object) -> Self:
         """Create an object from ``known`` fields and functions that compute the other fields."""
         made = cls.__new__(cls)
         made.__dict__.update(known, _makers=dict(makers))
@@ -30,10 +30,10 @@ class LazyValue:
             return self._make(name)
 
     @one_at_a_time
-    def _make(self, name: str) -> Any:
+    def _make(self, name: str) -> object:
         if name not in self.__dict__:  # another thread may have stored it meanwhile
             self.__dict__[name] = self.__dict__["_makers"][name]()
         return self.__dict__[name]
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return type(self), tuple(getattr(self, field.name) for field in fields(cast(Any, self)))

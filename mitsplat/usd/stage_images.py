@@ -32,7 +32,7 @@ def image_settings(stage: Usd.Stage, camera: Usd.Prim, time: Usd.TimeCode) -> Js
     product = next((one for one in _products(stage) if camera.GetPath() in one.GetCameraRel().GetTargets()), None)
     sources = [source for source in (product, settings) if source]
 
-    def stated(name: str, default: Any) -> Any:
+    def stated(name: str, default: object) -> Any:
         found = [source.GetPrim().GetAttribute(name) for source in sources]
         first = next((one for one in found if one.HasAuthoredValue()), found[0] if found else None)
         return default if first is None else first.Get(time)

@@ -56,7 +56,7 @@ class Step:
 
     name: str
     quality: Quality
-    overrides: Mapping[str, Any] = field(default_factory=dict)
+    overrides: Mapping[str, object] = field(default_factory=dict)
     captured: bool = False
     mesh_paths: int = 0
 
@@ -144,7 +144,7 @@ def measure_steps(
     *,
     tolerances: Sequence[float] = (),
     frames: int = 3,
-    overrides: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, object] | None = None,
     allow_outside: bool = False,
     progress: Progress | None = None,
     device: Device | None = None,
@@ -189,7 +189,7 @@ def measure_steps(
     return [rows[step.name] for step in steps]
 
 
-def _steps_of(path: Path, overrides: Mapping[str, Any] | None, allow_outside: bool) -> tuple[Step, ...]:
+def _steps_of(path: Path, overrides: Mapping[str, object] | None, allow_outside: bool) -> tuple[Step, ...]:
     """Return all steps that apply to a file."""
     if _is_splats(path):
         return STEPS
@@ -223,7 +223,7 @@ def choose_preset(
     path: str | Path,
     tolerance: float,
     *,
-    overrides: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, object] | None = None,
     allow_outside: bool = False,
     progress: Progress | None = None,
     device: Device | None = None,

@@ -63,7 +63,7 @@ def _draw_values(light: LightSpec, draw: LightDraw, seed: int, name: str, number
         value = random_stream(seed, f"light {name} {key}", number).uniform(low, high)
         return tuple(value.tolist()) if isinstance(value, np.ndarray) else float(value)
 
-    state: dict[str, Any] = {"draw": None}
+    state: dict[str, object] = {"draw": None}
     for key in _UNIFORM:
         if (bounds := getattr(draw, key)) is not None:
             state[key] = uniform(key, *bounds)
@@ -89,7 +89,7 @@ def _at_time(light: LightSpec, time: float) -> LightSpec:
     times = np.linspace(0.0, 1.0, len(light.path))
     positions = np.array([key.position or light.position for key in light.path])
     place = tuple(float(np.interp(time, times, positions[:, axis])) for axis in range(3))
-    state: dict[str, Any] = {"position": place, "path": ()}
+    state: dict[str, object] = {"position": place, "path": ()}
     if light.temperature is not None:
         inverse_kelvins = [1.0 / (key.temperature or light.temperature) for key in light.path]
         state["temperature"] = float(1.0 / np.interp(time, times, inverse_kelvins))

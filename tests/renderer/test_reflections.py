@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import SH_C0, evaluate_sh
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import place_surfels
@@ -246,6 +246,30 @@ def test_mirror_shows_an_object_at_its_image() -> None:
     seen = (light.light[..., 0] < 0.75) & floor_seen
     assert expected.sum() > 100
     assert (seen & expected).sum() / (seen | expected).sum() > 0.85
+
+
+def test_mirror_shows_captured_colours_of_its_directions() -> None:
+    """A captured ceiling is brighter at grazing angles: a small mirror shows 0.5 + sum_k sh_k Y_k(d), decoded."""
+    make_integrator()
+    sh = np.zeros((1600, 4, 3))
+    sh[:, 1:, 0], sh[:, 1:, 1], sh[:, 2, 2] = 0.1, (-0.1, 0.05, 0.1), -0.2
+    small = replace(floor(0.05), materials=SplatMaterials.uniform(1600, metallic=1.0, roughness=0.02))
+    turn = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))
+    ceiling = replace(floor(4.0, z=1.0), sh=sh).transformed(turn.T)
+    scene = {
+        "type": "scene",
+        "mirror": make_splats_shape(small, proxy=slab(0.05), instance=1),
+        "ceiling": make_splats_shape(ceiling, turn, proxy=slab(4.0, top=1.0).apply_transform(turn.T)),
+        "sky": WHITE_SKY,
+    }
+    camera = Camera.look_at((0.3, -0.6, 0.5), (0, 0, 0), width=40, height=30, fov_x=5)
+    layers = render_layers(make_integrator(white=np.pi, hide_emitters=True), mi.load_dict(scene), camera)
+    along = camera.world_from_camera[:3, 2] * (1, 1, -1)
+    expected = decode_srgb(evaluate_sh(sh[0], along))
+    assert np.ptp(expected) > 0.1
+    inside = binary_erosion(layers.instance == 1, iterations=2)
+    seen = (layers.light + layers.highlight)[inside].mean(axis=0)
+    np.testing.assert_allclose(seen, expected, rtol=0.02)
 
 
 def test_reflections_at_a_silhouette_are_averaged() -> None:

@@ -166,7 +166,7 @@ class Reflectors:
             ground = static.intersect(ray)
             hit = ground.is_valid()
             if self.grid is not None:
-                captured = dr.select(hit, self.grid.at(ray(dr.select(hit, ground.t, 0)), hit), 0)
+                captured = dr.select(hit, self.grid.at(ray, dr.select(hit, ground.t, 0), hit), 0)
             ray.maxt = distance = ground.t
             triangle = ground.prim_index
             dr.eval(triangle, ray, captured)

@@ -131,13 +131,13 @@ class BoxScene:
         towards = hemisphere(128)
         return towards, self._colours(point, towards) * np.pi / len(towards)
 
-    def _colours(self, point: Array, towards: Array, bounces: int = 2) -> Array:
+    def _colours(self, point: Array, towards: Array, bounces: int = 2, *, dynamic_only: bool = False) -> Array:
         """Return the colours (N,) of boxes along rays, 0 for other rays, on paths of ``bounces`` dynamic boxes."""
         entries = np.array([box.entry(point, towards) for box in self.boxes])
         colours, nearest = np.zeros(len(towards)), entries.argmin(axis=0)
         for number, box in enumerate(self.boxes):
             hit = (nearest == number) & (entries[number] < np.inf)
-            if not hit.any() or (box.dynamic and not box.albedo):
+            if not hit.any() or not (box.albedo if box.dynamic else not dynamic_only):
                 continue
             places = point + towards[hit] * entries[number][hit, None]
             normals = box.normals(places)
@@ -154,7 +154,8 @@ class BoxScene:
         normal, few = np.array(cell[3:]), replace(self, lamp=replace(self.lamp, count=6))
         point = np.array(cell[:3]) + 1e-4 * normal
         if not box.dynamic:
-            return self.grey * few._share_left(point, normal)
+            kept = self.grey * few._share_left(point, normal)
+            return kept + (few._reflected_onto_captured(point, normal) if bounces > 1 else 0.0)
         light = few._irradiance(point, normal, rings=16) / self.white
         if bounces > 1 and not box.mesh:
             light += float(np.mean(self._colours(point, turned(hemisphere(12), normal), bounces - 1)))
@@ -177,6 +178,16 @@ class BoxScene:
         lost = lamp[(dynamic < distance) & (static >= distance)].sum()
         static, dynamic = self._entries(point, to_sky)
         return float(1 - (lost + sky[dynamic < static].sum()) / (lamp.sum() + sky.sum()))
+
+    def _reflected_onto_captured(self, point: Array, normal: Array) -> float:
+        """Return the light that dynamic boxes reflect onto a captured box, times its albedo.
+
+        The captured colour is the albedo times the irradiance of the emitters over white.
+        """
+        towards = turned(hemisphere(16), normal)
+        light = self._colours(point, towards, dynamic_only=True).mean()
+        open_place = replace(self, boxes=())._irradiance(point, normal, rings=16)
+        return float(light) * min(self.grey * self.white / open_place, 1.0)
 
     def _entries(self, point: Array, towards: Array) -> tuple[Array, Array]:
         """Return the distances (N,) at which rays enter static and dynamic boxes."""

@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from mitsplat.renderer.light.light_filter import RADIUS, Estimate, LightFilter
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
-from mitsplat.renderer.light.reflectors import Reflectors
+from mitsplat.renderer.light.reflectors import MIN_COVER, Reflectors
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
 from mitsplat.renderer.rays.device_arrays import gathered
 
@@ -32,10 +32,8 @@ CELL_RAYS = 4
 COVER_CELL = 4
 """Edge [px] of the cells in which :func:`object_cover` is constant."""
 
-MIN_COVER, MAX_SHARE = 0.03, 0.85
-"""Share of the hemisphere that objects cover, and share of light that arrives, from and to which reflected light is
-traced at captured points.
-"""
+MAX_SHARE = 0.85
+"""Share of light that arrives below which reflected light is traced at captured points, as it is near objects."""
 
 MESH_RAYS = 2
 """Rays per cell on visible meshes such as a table; averages over even surfaces reduce the noise."""

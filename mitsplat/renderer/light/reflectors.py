@@ -1,8 +1,8 @@
 """Light that surfaces reflect along rays: captured surroundings, objects and visible meshes.
 
 Captured surroundings keep their captured colour, which contains all earlier bounces. Dynamic objects cast shadows on
-them. Objects and visible meshes reflect the emitters' light according to their material, and the light of one further
-ray, which ends at the next surface.
+them and reflect light onto them. Objects and visible meshes reflect the emitters' light according to their material,
+and the light of one further ray, which ends at the next surface.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ LANES = 1 << 20
 BOUNCES = 2
 """Number of objects along a path. The last one is diffuse: a metal then reflects the mean of the light around it."""
 
+MIN_COVER = 0.03
+"""Share of the hemisphere that an object covers from which its light on captured surroundings is traced."""
+
 CANDIDATES = 4
 """Sampled emitters of which one is tested for the shadow of dynamic objects on captured surroundings."""
 
@@ -42,6 +45,9 @@ With this sequence it is 3 %.
 
 DIFFUSE_SPREAD = 0.5
 """GGX's alpha of a diffuse reflection in :func:`widened`."""
+
+CAPTURED_SPREAD = 0.25
+"""This alpha for light of objects on captured surroundings, where a metal below a lamp lights a small area."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,9 +188,8 @@ class Reflectors:
         dr.eval(near, colour, captured, hits_object, distance, has_colour)
         lane = dr.compress(has_colour)
         if static is not None and dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (ray, triangle, key, emitter_sample))
-            free = self._unshadowed(static, *some)
-            dr.scatter(colour, dr.select(free, dr.gather(mi.Color3f, colour, lane), 0), lane)
+            some = (dr.gather(type(v), v, lane) for v in (colour, ray, triangle, key, emitter_sample))
+            dr.scatter(colour, self._relit_capture(static, bounces, *some), lane)
         lane = dr.compress(hits_object)
         if dr.width(lane):
             some = (dr.gather(type(v), v, lane) for v in (ray, near, key, emitter_sample, spread))
@@ -192,17 +197,78 @@ class Reflectors:
         dr.eval(colour)
         return colour, captured, distance
 
+    def _relit_capture(
+        self,
+        static: TraceScene,
+        bounces: int,
+        captured: mi.Color3f,
+        ray: mi.Ray3f,
+        triangle: mi.UInt32,
+        key: mi.UInt32,
+        emitter_sample: mi.Point2f,
+    ) -> mi.Color3f:
+        """Return the colour (Color3f) of captured surfaces with the shadows and the reflected light of objects."""
+        normal = _towards(static.normal_at(triangle, mi.Bool(True)), ray)
+        origin = _lifted(ray(ray.maxt), normal)
+        colour = dr.select(self._unshadowed(static, receiver(origin, normal), key, emitter_sample), captured, 0)
+        dynamic, boxes = self.proxies.dynamic, self.proxies.boxes
+        if bounces == 1 or boxes is None or dynamic is None or dynamic.materials is None:
+            return colour
+        near_objects = boxes.form_factor(origin, normal) > MIN_COVER
+        dr.eval(colour, origin, normal, near_objects)
+        lane = dr.compress(near_objects)
+        if dr.width(lane):
+            some = (dr.gather(type(v), v, lane) for v in (captured, origin, normal, key))
+            dr.scatter_add(colour, self._reflected_onto_capture(static, dynamic, *some), lane)
+        return colour
+
+    def _reflected_onto_capture(
+        self,
+        static: TraceScene,
+        dynamic: TraceScene,
+        captured: mi.Color3f,
+        origin: mi.Point3f,
+        normal: mi.Normal3f,
+        key: mi.UInt32,
+    ) -> mi.Color3f:
+        """Return the colour (Color3f) that the light of objects adds to captured surfaces, from one ray each.
+
+        The captured colour is albedo * E / white with the irradiance E of the emitters, so that
+
+            added colour = min(captured * white / E, 1) * mean colour of objects over the cosine-weighted hemisphere
+        """
+        numbers = [_sequence_number(key, dimension) for dimension in range(4)]
+        upward = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*numbers[:2]))
+        ray, emitter_sample = mi.Ray3f(origin, mi.Frame3f(normal).to_world(upward)), mi.Point2f(*numbers[2:])
+        if self.emitters.sky is not None:
+            ray.maxt = self.emitters.sky_reach
+        near = dynamic.intersect(ray)
+        hits_object = near.is_valid()
+        dr.eval(ray, near, hits_object, emitter_sample)
+        added = dr.zeros(mi.Color3f, dr.width(key))
+        lane = dr.compress(hits_object)
+        if not dr.width(lane):
+            return added
+        some = (dr.gather(type(v), v, lane) for v in (ray, near, key, emitter_sample, captured, normal))
+        ray, near, key, emitter_sample, captured, normal = some
+        ray.maxt = near.t
+        free = ~static.intersect(ray).is_valid()
+        dr.eval(ray, near, key, emitter_sample, captured, normal, free)
+        spread = dr.opaque(mi.Float, CAPTURED_SPREAD, dr.width(key))
+        light = self._reflected(2, ray, near, key * 0x9E3779B1 + 0x85EBCA77, emitter_sample, spread)
+        irradiance = self.emitters.unoccluded_irradiance(receiver(ray.o, normal), free)
+        albedo = dr.minimum(captured * self.white / dr.maximum(irradiance, 1e-20), 1)
+        dr.scatter(added, dr.select(free, albedo * light, 0), lane)
+        return added
+
     def _unshadowed(
-        self, static: TraceScene, ray: mi.Ray3f, triangle: mi.UInt32, key: mi.UInt32, emitter_sample: mi.Point2f
+        self, static: TraceScene, place: mi.SurfaceInteraction3f, key: mi.UInt32, emitter_sample: mi.Point2f
     ) -> mi.Bool:
         """Return False for captured surfaces that dynamic objects shade from one sampled emitter.
 
         The expected value is the share of the light that arrives, because one of several samples is chosen in
         proportion to its irradiance (Talbot et al. 2005, "Importance Resampling for Global Illumination").
         """
-        normal = _towards(static.normal_at(triangle, mi.Bool(True)), ray)
-        origin = _lifted(ray(ray.maxt), normal)
-        place = receiver(origin, normal)
 
         def choose(
             i: mi.UInt32, rest: mi.Float, total: mi.Float, direction: mi.Vector3f, reach: mi.Float, sky: mi.Bool
@@ -229,7 +295,7 @@ class Reflectors:
         state = dr.zeros(mi.UInt32, count), _sequence_number(key, 4), *nothing
         state = dr.while_loop(state, lambda i, *_: i < last, choose, label="candidates")
         _, _, total, direction, reach, sky = state
-        shadow, shaded = _shadow_ray(origin, direction, reach), total > 0
+        shadow, shaded = _shadow_ray(place.p, direction, reach), total > 0
         self._end_kernel(shadow, key, shaded, sky)
         shaded &= self._occluded(shadow, mi.UInt32(0), key, shaded, self.proxies.shadow_casters)
         wall = static.intersect(shadow, shaded)

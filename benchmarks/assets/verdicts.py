@@ -36,7 +36,8 @@ from mitsplat.asset import Asset
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
-from mitsplat.geometry.camera import Camera, spiral
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import spiral
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, iou, show_asset
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
 from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings

@@ -16,7 +16,7 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from benchmarks.detector import clutter
 from benchmarks.detector.clutter import Material, Thing, matt, metal, plate, tube, vivid
 from benchmarks.light.shadow_scenes import block
-from mitsplat.geometry.camera import look_at_pose
+from mitsplat.geometry.camera_poses import look_at_pose
 from scenes.build.parts import turned
 
 ROOM = np.array([(-2.3, -2.9, -0.85), (2.3, 1.7, 1.85)])

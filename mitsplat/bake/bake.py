@@ -31,7 +31,8 @@ from mitsplat.fit.refine_splats import Picture, refine_splats
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import Surfels
-from mitsplat.geometry.camera import Camera, spiral
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.images.colour import encode_srgb
 from mitsplat.mesh_files.mesh_file import MeshFile

@@ -15,7 +15,7 @@ from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_materials import MAX_SPECULAR
-from mitsplat.geometry.camera import spiral
+from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.coplanar import coplanar_place
 from mitsplat.geometry.mesh_normals import corner_normals
 from mitsplat.images.colour import decode_srgb, encode_srgb

@@ -15,7 +15,7 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_basis
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import Surfels
-from mitsplat.geometry.camera import spiral
+from mitsplat.geometry.camera_poses import spiral
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.progress import Progress
 from mitsplat.renderer.path_tracing import RAYS_PER_LAUNCH, trace_radiance

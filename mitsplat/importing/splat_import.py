@@ -21,7 +21,8 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError, check_fields, check_number, check_text, check_type, path_of
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import Axis, default_up_axis
-from mitsplat.geometry.camera import Camera, spiral
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.gltf_splats.splat_reading import is_gltf, read_gltf_splats
 from mitsplat.importing.upright import Plane, Upright, cut_support, find_up

@@ -28,7 +28,8 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
-from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.fold_repair import limit_motion
 from mitsplat.reconstruct.segment_splats import MaskedView

@@ -11,7 +11,8 @@ from scipy.ndimage import binary_closing, binary_dilation, binary_erosion, label
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.camera import Camera, direction
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import direction
 from mitsplat.surroundings.depth_views import DepthView, SurfacePoints, depth_views
 from mitsplat.surroundings.supports import Support
 

@@ -16,7 +16,7 @@ import trimesh
 from scipy.ndimage import binary_closing, binary_opening, label
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.geometry.camera import direction
+from mitsplat.geometry.camera_poses import direction
 from mitsplat.geometry.rigid import split_similarity, transform_points
 from mitsplat.importing.upright import POINTS, largest_plane, rotation_to_z
 from mitsplat.surroundings.depth_views import SurfacePoints

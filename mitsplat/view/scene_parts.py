@@ -20,7 +20,8 @@ from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.geometry.rigid import transform_points
 from mitsplat.labels.overlay import class_colour
 from mitsplat.scene.layout import Layout

@@ -14,7 +14,7 @@ from PIL import Image, ImageSequence
 
 from mitsplat.frames import frame, layer_sheet
 from mitsplat.frames import mitsuba_xml as xml_scene
-from mitsplat.geometry.camera import look_at_pose
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.physics import settle
 from mitsplat.scene.layout import Layout
 from tests.cli.typed import Calls, run

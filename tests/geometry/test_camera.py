@@ -12,7 +12,8 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.formats.colmap import camera_model
-from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.geometry.lens import turning_slope
 from mitsplat.renderer.layers import describe_sensor
 from mitsplat.runtime.variant import ensure_variant

@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.geometry.lens import Lens, distortion_coefficients, turning_angle, turning_slope, undistort
 from mitsplat.renderer.layers import describe_sensor
 from mitsplat.runtime.variant import ensure_variant

@@ -15,7 +15,8 @@ import pytest
 from scipy.stats import spearmanr
 
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.images.colour import encode_srgb
 from mitsplat.quality import PRESETS, PresetName, Quality
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers, render_splats

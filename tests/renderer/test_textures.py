@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from mitsplat.geometry.camera import Camera, look_at_pose
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.renderer.layers import make_sensor
 from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes
 from mitsplat.renderer.rays.sensors import view_of

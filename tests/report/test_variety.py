@@ -12,7 +12,7 @@ import pytest
 from pycocotools import mask as coco_mask
 from scipy.spatial.transform import Rotation
 
-from mitsplat.geometry.camera import look_at_pose
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.pages.svg_charts import discs
 from mitsplat.report import variety
 from mitsplat.report.dataset_report import write_report

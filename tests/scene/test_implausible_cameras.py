@@ -13,7 +13,7 @@ import mitsplat as ms
 from mitsplat.checks.exposure_check import check_exposure
 from mitsplat.checks.path_checks import _check_view
 from mitsplat.dataset.preflight import label_faults, scene_warnings
-from mitsplat.geometry.camera import look_at_pose
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.scene.planning.lens_warnings import lens_warnings
 from tests.conftest import WriteScene
 

@@ -9,7 +9,7 @@ import pytest
 
 from mitsplat.asset import Asset
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.camera import look_at_pose
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame

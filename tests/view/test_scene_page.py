@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import ByteImage
-from mitsplat.geometry.camera import look_at_pose
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.scene.planning.viewpoints import viewpoint_of
 from mitsplat.view.page import Address, Page
 from mitsplat.view.previews import SceneRenders, ViewRequest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from mitsplat.geometry.camera import look_at_pose
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.spec.camera_spec import Intrinsics

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mitsplat.geometry.camera import direction
+from mitsplat.geometry.camera_poses import direction
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightDraw, LightSpec, RoomLight
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.streams import random_stream, weighted_choice

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
-from mitsplat.geometry.camera import Camera, direction, interpolate_poses, look_at_pose
+from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import direction, interpolate_poses, look_at_pose
 from mitsplat.scene.planning.visibility_prediction import PredictedView, VisibilityPredictor, containing_solid
 from mitsplat.scene.spec.camera_spec import TRIES, Acceptance, CameraFixed, CameraHemisphere, CameraOrbit, Intrinsics
 from mitsplat.scene.spec.scene_spec import Output, SceneSpec

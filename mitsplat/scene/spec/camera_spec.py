@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, model_validator
 
 from mitsplat.arrays import Float64Array
-from mitsplat.geometry.camera import NEAR, look_at_pose
+from mitsplat.geometry.camera import NEAR
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.geometry.lens import Lens, distortion_coefficients, flat_coefficients, is_pinhole
 from mitsplat.geometry.rigid import ROUNDED, nearest_rigid, rigid_matrix
 from mitsplat.storage.field_types import (

@@ -148,7 +148,11 @@ YOLO_FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "fraction": (_line("0.5 0.1 0.1 0.2 0.1 0.2 0.2\n"), r"the class must be 0 to 1 \(got 0.5\)"),
     "beyond": (_line("0 0.1 0.1 0.2 0.1 1.2 0.2\n"), r"must lie in the image, .* \(got 1.2\)"),
     "nan": (_line("0 0.1 0.1 0.2 nan 0.2 0.2\n"), r"must lie in the image, .* \(got nan\)"),
-    "torn": (_line("0 0.1 0.1 0.2 0.1 0.2\n"), r"000001.txt:1: must be a class and a box .* \(got 6\)"),
+    "torn": (
+        _line("0 0.1 0.1 0.2 0.1 0.2\n"),
+        r"000001.txt:1: must be a class and a box .* \(got 6 numbers\): is the last one a",
+    ),
+    "pixels": (_line("0 50 40 40 40\n"), r"must lie in the image, .* \(got 70\): are they pixels\?"),
     "word": (_line("0 0.1 0.1 o.2 0.1 0.2 0.2\n"), r"000001.txt:1: must be numbers"),
     "negative": (_line("0 0.5 0.5 -0.1 0.2\n"), r"000001.txt:1: must have a width and a height of at least 0"),
     "count": (
@@ -237,7 +241,7 @@ def test_each_fault_of_a_yolo_folder_is_one_sentence(tmp_path: Path, fault: str)
     spoil(root)
     with pytest.raises(InputError, match=message) as told:
         read_set(root, "train")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(told.value) and "run lengths (" not in str(told.value)
 
 
 def test_a_dataset_that_lacks_a_label_is_refused(tmp_path: Path) -> None:
@@ -303,10 +307,22 @@ COCO_FAULTS: dict[str, tuple[Callable[[dict], object], str]] = {  # type: ignore
     ),
     "crowd": (lambda c: c["annotations"][0].update(iscrowd="0"), "iscrowd must be 0 or 1 \\(got '0'\\)"),
     "key": (lambda c: c["annotations"][0].pop("image_id"), "key 'image_id' is missing"),
-    "names": (lambda c: c["categories"][0].update(name="box"), "names of categories, must differ"),
+    "names": (lambda c: c["categories"][0].update(name="box"), r"names of categories must differ \(got 'box' twice\)"),
     "ids": (
         lambda c: [one.update(id=1) for one in c["categories"]] + [a.update(category_id=1) for a in c["annotations"]],
-        "ids and names of categories, must differ",
+        r"ids of categories must differ \(got 1 twice\)",
+    ),
+    "image ids": (
+        lambda c: c["images"][1].update(id=c["images"][0]["id"]),
+        r"ids of images must differ \(got \d+ twice",
+    ),
+    "two points": (
+        lambda c: c["annotations"][0].update(segmentation=[[1, 1, 5, 5]]),
+        r"labels\.json: annotation \d+: segmentation must be polygons of 3 points or more \(got 4 numbers\)$",
+    ),
+    "mask size": (
+        lambda c: c["annotations"][0].update(segmentation={"size": [96, 64], "counts": [96 * 64]}),
+        r"labels\.json: annotation \d+: segmentation must be of 64 x 96 px \(got \[96, 64\]\)$",
     ),
     "nothing": (lambda c: c.update(images=[], annotations=[]), "there are no images"),
 }
@@ -321,7 +337,7 @@ def test_each_fault_of_a_coco_folder_is_one_sentence(tmp_path: Path, fault: str)
     (root / "labels.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=message) as told:
         read_set(root, "train")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(told.value) and "run lengths (" not in str(told.value)
 
 
 def test_an_empty_or_missing_folder_is_refused(tmp_path: Path) -> None:

@@ -38,6 +38,8 @@ def read_annotation(annotation: JsonObject, class_index: int, size: tuple[int, i
     if annotation.get("segmentation"):
         try:
             rle = _read_segmentation(annotation["segmentation"], size, place)
+        except InputError:
+            raise
         except (KeyError, TypeError, ValueError, IndexError, ArithmeticError) as error:
             raise InputError(f"{place}: segmentation must be polygons or run lengths ({error})") from error
         _check_box_of_mask(np.array([x, y, w, h]), corners, rle, place)

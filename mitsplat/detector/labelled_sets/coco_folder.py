@@ -59,6 +59,13 @@ def _coco_part(root: Path, split: Split, path: Path, content: JsonObject, progre
         names = tuple(str(category["name"]) for category in categories)
         index = {category["id"]: i for i, category in enumerate(categories)}
         by_image: dict[int | str, list[JsonObject]] = {image["id"]: [] for image in content["images"]}
+        for what, values in (
+            ("ids of images", [image["id"] for image in content["images"]]),
+            ("ids of categories", [category["id"] for category in categories]),
+            ("names of categories", names),
+        ):
+            if double := [value for value, count in Counter(values).items() if count > 1]:
+                raise InputError(f"{path}: {what} must differ (got {double[0]!r} twice)")
         for annotation in content["annotations"]:
             for key, known in (("image_id", by_image), ("category_id", index)):
                 if annotation[key] not in known:
@@ -69,8 +76,6 @@ def _coco_part(root: Path, split: Split, path: Path, content: JsonObject, progre
             by_image[annotation["image_id"]].append(annotation)
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: must be a COCO dataset of instances (key {error} is missing or wrong)") from error
-    if len(set(names)) < len(names) or len(index) < len(names) or len(by_image) < len(content["images"]):
-        raise InputError(f"{path}: ids of images, and ids and names of categories, must differ")
     if not by_image:
         raise InputError(f"{root}: there are no images for {split}")
     boxes = [annotation.get("bbox") for annotation in content["annotations"]]

@@ -23,6 +23,8 @@ Split = Literal["train", "val", "test", "all"]
 
 _OUTSIDE_TOLERANCE = 0.01
 """Largest distance of a position from the image, as a share of its sides; such positions are clipped."""
+_PIXELS = 3.0
+"""Positions above this share of the sides of an image are probably pixels."""
 
 
 Item = TypeVar("Item")
@@ -184,8 +186,9 @@ def clip_points(points: Float64Array, size: tuple[int, int], place: str) -> Floa
         np.isfinite(shares).all() and shares.min() >= -_OUTSIDE_TOLERANCE and shares.max() <= 1 + _OUTSIDE_TOLERANCE
     ):
         worst = shares.ravel()[np.abs(np.nan_to_num(shares.ravel(), nan=np.inf) - 0.5).argmax()]
+        hint = ": are they pixels?" if worst > _PIXELS and max(size) > 1 else ""
         raise InputError(
-            f"{place}: positions must lie in the image, at 0 to 1 of its width and height (got {worst:.4g})"
+            f"{place}: positions must lie in the image, at 0 to 1 of its width and height (got {worst:.4g}){hint}"
         )
     return np.clip(points, 0, size)
 

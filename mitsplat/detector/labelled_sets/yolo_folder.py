@@ -180,8 +180,10 @@ def _yolo_instances(text: str, path: Path, num_classes: int, size: tuple[int, in
         except ValueError as error:
             raise InputError(f"{place}: must be numbers (got {line[:60]!r})") from error
         if len(values) != 5 and (len(values) < 7 or len(values) % 2 == 0):
+            hint = ": is the last one a confidence or a track?" if len(values) == 6 else ""
             raise InputError(
-                f"{place}: must be a class and a box (5 numbers) or a polygon of 3 points or more (got {len(values)})"
+                f"{place}: must be a class and a box (5 numbers) or a polygon of 3 points or more (got {len(values)} "
+                f"numbers){hint}"
             )
         if values[0] not in range(num_classes):
             raise InputError(f"{place}: the class must be 0 to {num_classes - 1} (got {words[0]})")

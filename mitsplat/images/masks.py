@@ -133,6 +133,12 @@ def without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, in
     return keep[parts], int(count - 1 - np.count_nonzero(keep))
 
 
+def largest_part(mask: BoolArray) -> BoolArray:
+    """Return the largest connected part of a mask (8-connectivity); the mask itself if it is empty."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    return parts == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else mask
+
+
 def _is_connected(pixels: npt.NDArray[np.uint8]) -> bool:
     """Return True if a mask is one connected part (8-connectivity).
 

@@ -18,18 +18,10 @@ from mitsplat.capture.boards.board_mask import bare_squares
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
 from mitsplat.capture.exposure import even_exposure
+from mitsplat.capture.geometric_masks import object_masks, object_points
 from mitsplat.capture.isolation import ChosenObject, occluded_part
 from mitsplat.capture.known_poses import read_poses
-from mitsplat.capture.photo_masks import (
-    add_masks,
-    check_borders,
-    cutout_masks,
-    given_masks,
-    model_masks,
-    object_masks,
-    object_points,
-    plain_masks,
-)
+from mitsplat.capture.photo_masks import add_masks, check_borders, cutout_masks, given_masks, model_masks, plain_masks
 from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
 from mitsplat.capture.pipeline.overview import capture_sheet
 from mitsplat.capture.pipeline.picking import chosen_object

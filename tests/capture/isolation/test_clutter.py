@@ -18,7 +18,7 @@ from benchmarks.assets.clutter import GROUNDS, exposures, room, walk
 from benchmarks.assets.known import solid, speckled
 from benchmarks.assets.photographing import Sensors, by_name, photograph, show_where
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.photo_masks import object_masks
+from mitsplat.capture.geometric_masks import object_masks
 from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.reconstruct.asset_evaluation import iou
 from mitsplat.runtime.variant import ensure_variant

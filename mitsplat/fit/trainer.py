@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -25,16 +25,14 @@ from mitsplat.fit.fit_folder import FitFolder, FitResult
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.optimizer import Adam, GaussianModel
+from mitsplat.fit.photo_loss import LossConstants, depth_image, photo_gradients
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
-from mitsplat.fit.training_view import HeldOut, TrainingView, unpacked
+from mitsplat.fit.training_view import HeldOut, TrainingView
 from mitsplat.fit.windows import object_windows
-from mitsplat.geometry.camera import Camera
 from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation.backward import DepthRendering
-from mitsplat.renderer.differentiation.photometric_loss import photometric_loss
-from mitsplat.renderer.rays.device_arrays import number, on_device
+from mitsplat.renderer.rays.device_arrays import on_device
 from mitsplat.runtime.cores import usable_cores
-from mitsplat.runtime.recorded_kernels import recorded
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.storage.content_hash import ContentHash
 from mitsplat.version import __version__
@@ -331,15 +329,15 @@ class _Fit:
         seen = self.model.render(view.eye, quality, depth=known > 0)
         behind = rng.random(3) if s.background == "random" else np.zeros(3)
         numbers = on_device(*behind, weight * self.extent, 1 / max(known, 1))
-        constants = _LossConstants(
+        constants = LossConstants(
             view.camera.width,
             view.camera.height,
             s.ssim_share,
             s.alpha_weight if s.masks == "alpha" and view.masked else None,
             background=s.background == "random",
         )
-        depth = (seen.moment, _depth_image(view.camera, pixel, inverse)) if isinstance(seen, DepthRendering) else None
-        gradient, error = _gradients(seen.rgb, seen.alpha, depth, (view.packed, view.hidden), numbers, constants)
+        depth = (seen.moment, depth_image(view.camera, pixel, inverse)) if isinstance(seen, DepthRendering) else None
+        gradient, error = photo_gradients(seen.rgb, seen.alpha, depth, (view.packed, view.hidden), numbers, constants)
         records = [seen.gradient(gradient["rgb"], gradient["alpha"])]
         if isinstance(seen, DepthRendering):
             records.append(seen.gradient_of_moment(gradient["moment"]))
@@ -390,82 +388,6 @@ class _Fit:
     def _stateful_parts(self) -> dict[str, Adam | Densification]:
         """Parts with a state that changes in every step, by their names in checkpoints."""
         return {"model": self.model, "densification": self.densification}
-
-
-class _LossConstants(NamedTuple):
-    """Constants of the loss that determine its kernels."""
-
-    width: int
-    height: int
-    ssim_share: float
-    alpha_weight: float | None
-    background: bool
-
-
-@recorded
-def _gradients(
-    rgb: list[mi.Float],
-    alpha: mi.Float,
-    depth: tuple[mi.Float, mi.Float] | None,
-    photo: tuple[mi.UInt32, mi.Bool | None],
-    numbers: mi.Float,
-    constants: _LossConstants,
-) -> tuple[dict[str, Any], mi.Float]:
-    """Return the gradients of the loss of one photo, and the mean squared error of its pixels.
-
-    Args:
-        rgb: Rendered colours, three flat row-major arrays.
-        alpha: Rendered opacity.
-        depth: Depth moment of the rendering, and known inverse depths from :func:`_depth_image`.
-        photo: Packed pixels, and a mask of the pixels where the object may be hidden, or None.
-        numbers: Background red, green and blue; weight of depth; inverse number of known depths.
-        constants: Constants of the loss.
-
-    Returns:
-        Gradients of ``rgb``, ``alpha``, and of ``moment`` if it exists; and the error.
-    """
-    inputs: dict[str, Any] = {"rgb": [mi.Float(c) for c in rgb], "alpha": mi.Float(alpha)}
-    if depth is not None:
-        inputs["moment"] = mi.Float(depth[0])
-    dr.enable_grad(inputs)
-    rgb, alpha, loss = inputs["rgb"], inputs["alpha"], mi.Float(0)
-    if depth is not None:
-        loss += number(numbers, 3) * number(numbers, 4) * _depth_error(alpha, inputs["moment"], depth[1])
-    target, mask = unpacked(photo[0])
-    if constants.background:
-        behind = [number(numbers, channel) for channel in range(3)]
-        rgb = [c + b * (1 - alpha) for c, b in zip(rgb, behind, strict=True)]
-        target = [c + b * (1 - mask) for c, b in zip(target, behind, strict=True)]
-    if photo[1] is not None:  # no loss where the object may be hidden
-        target = [dr.select(photo[1], dr.detach(c), t) for c, t in zip(rgb, target, strict=True)]
-        mask = dr.select(photo[1], dr.detach(alpha), mask)
-    loss += photometric_loss(rgb, target, constants.width, constants.height, constants.ssim_share)
-    if constants.alpha_weight is not None:
-        loss += constants.alpha_weight * dr.mean(dr.abs(alpha - mask))
-    error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
-    dr.backward(loss)
-    return {name: dr.grad(value) for name, value in inputs.items()}, error
-
-
-def _depth_image(camera: Camera, pixel: mi.UInt32, inverse: mi.Float) -> mi.Float:
-    """Return inverse depths [1/m] at distinct pixels as a flat row-major image, NaN elsewhere."""
-    image = dr.full(mi.Float, dr.nan, camera.width * camera.height)
-    dr.scatter(image, inverse, pixel)
-    dr.eval(image)
-    return image
-
-
-def _depth_error(alpha: mi.Float, moment: mi.Float, inverse: mi.Float) -> mi.Float:
-    """Return the sum of absolute differences between the inverse depths of splats and of an image [1/m]."""
-    known = dr.isfinite(inverse)
-    wanted = dr.select(known, inverse, 0)
-    # Gathered copies keep the gradients of this term apart; added to the other gradients of the layers they would be
-    # rounded.
-    pixel = dr.arange(mi.UInt32, dr.width(inverse))
-    cover, depth = (dr.gather(mi.Float, layer, pixel, mode=dr.ReduceMode.NoConflicts) for layer in (alpha, moment))
-    seen = known & (cover > 0.1) & (depth > 0)
-    found = dr.select(seen, cover / dr.select(seen, depth, 1), wanted)
-    return dr.sum(dr.abs(found - wanted))
 
 
 def _usable_photos(photos: tuple[Photo, ...], settings: FitSettings) -> tuple[Photo, ...]:

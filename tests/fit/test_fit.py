@@ -24,6 +24,7 @@ from mitsplat.fit import trainer as fit
 from mitsplat.fit.depth_priors import DepthMaps, align_maps
 from mitsplat.fit.fit_folder import FitResult
 from mitsplat.fit.initial_points import seed_points
+from mitsplat.fit.photo_loss import depth_error, depth_image
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
 from mitsplat.fit.training_view import TrainingView
 from mitsplat.gaussians.spherical_harmonics import SH_C0
@@ -391,9 +392,9 @@ def test_depth_error_is_the_difference_of_known_inverse_depths() -> None:
     ensure_variant()
     camera = replace(look(np.ones(3)), width=2, height=2)
     alpha, moment = mi.Float([1.0, 0.5, 0.05, 1.0]), mi.Float([2.0, 2.0, 1.0, 5.0])
-    known = fit._depth_image(camera, mi.UInt32([0, 1, 2]), mi.Float([0.4, 0.35, 0.9]))
+    known = depth_image(camera, mi.UInt32([0, 1, 2]), mi.Float([0.4, 0.35, 0.9]))
     assert np.isnan(np.array(known)).tolist() == [False, False, False, True]
-    found = fit._depth_error(alpha, moment, known)
+    found = depth_error(alpha, moment, known)
     assert found[0] == pytest.approx(0.1 + 0.1 + 0.0, abs=1e-6)  # pixels with little coverage are ignored
 
 

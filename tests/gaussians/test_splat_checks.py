@@ -97,3 +97,12 @@ def test_compressed_files_with_and_without_ranges_of_colours_are_read(tmp_path: 
     np.testing.assert_allclose(0.5 + SH_C0 * splats.sh[:, 0], [expected], atol=1e-5)
     assert splats.opacities == pytest.approx(0.8, abs=1e-5)
     np.testing.assert_allclose(np.abs(splats.quats), [[0, 0, 0, 1]], atol=2e-3)
+
+
+@pytest.mark.parametrize("column", ["x", "opacity", "f_dc_1"])
+def test_rows_of_nan_are_refused_with_a_remedy(tmp_path: Path, column: str) -> None:
+    values = np.linspace(-1, 1, 200)
+    values[7] = np.nan
+    rewrite(tmp_path / "a.ply", {column: ("float", values)})
+    with pytest.raises(InputError, match=r"a\.ply: .*\(got nan at row 7\): remove such Gaussians, as SuperSplat"):
+        Splats.load(tmp_path / "a.ply")

@@ -35,6 +35,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.geometry.rigid import transform_points
 from mitsplat.geometry.untrusted_meshes import check_mesh
+from mitsplat.mesh_files.mesh_file import MeshFrame
 from mitsplat.mesh_files.mesh_reading import SCENE_SUFFIXES, read_surface
 from mitsplat.storage.field_types import Name
 from mitsplat.storage.file_kinds import no_folder_with
@@ -384,20 +385,23 @@ def read_spec(folder: str | PathLike[str]) -> AssetSpec:
     return load_yaml(path, AssetSpec, newest=FORMAT_VERSIONS[ASSET_FILE])
 
 
-def read_mesh(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
-    """Read a mesh file of any format; several parts become one mesh, in the units and axes of the file.
+def read_mesh(path: Path, *, merge: bool = True, frame: MeshFrame | None = None) -> trimesh.Trimesh:
+    """Read a mesh file of any format; several parts become one mesh.
 
     Args:
         path: The file.
         merge: Merge vertices at the same position. Without merging, an STL is never watertight.
+        frame: Convert to metres with z up; by default, the mesh has the units and axes of the file.
 
     Raises:
         InputError: If the file is missing or damaged, has no triangles, or has a vertex that is not finite.
     """
-    if path.suffix.lower() in SCENE_SUFFIXES:
-        mesh = read_surface(path, merge=merge)
+    if path.suffix.lower() in SCENE_SUFFIXES or (frame is not None and path.suffix.lower() == ".dae"):
+        mesh = read_surface(path, merge=merge, frame=frame)
     else:
         mesh = _read_with_trimesh(path, merge=merge)
+        if frame is not None and isinstance(mesh, trimesh.Trimesh):
+            mesh.apply_transform(frame.to_world())
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: a mesh must have triangles (got none)")
     check_faces(mesh, path)

@@ -19,7 +19,15 @@ from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.coplanar import coplanar_place
 from mitsplat.geometry.mesh_normals import corner_normals
 from mitsplat.images.colour import decode_srgb, encode_srgb
-from mitsplat.mesh_files.mesh_file import DIELECTRIC_SPECULAR, OPAQUE, Axis, FilePart, MeshFile, Texture
+from mitsplat.mesh_files.mesh_file import (
+    DIELECTRIC_SPECULAR,
+    OPAQUE,
+    Axis,
+    FilePart,
+    MeshFile,
+    Texture,
+    world_from_file,
+)
 from mitsplat.mesh_files.mesh_reading import read_mesh_file
 from mitsplat.mesh_files.trimesh_files import scene_parts
 from mitsplat.renderer.rays.device_arrays import ray_scene
@@ -220,16 +228,6 @@ def read_model(
     warnings += _inverted_bodies(parts)
     warnings += _coincident_parts(parts)
     return MeshModel(tuple(parts), units, axis, tuple(stated), tuple(warnings))
-
-
-def world_from_file(metres_per_unit: float, up: Axis) -> Float64Array:
-    """Return the transform (4, 4) from the file's units and axes to metres, z up."""
-    matrix = np.diag([metres_per_unit, metres_per_unit, metres_per_unit, 1.0])
-    if up == "y":
-        matrix = matrix @ trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
-    elif up == "x":
-        matrix = matrix @ trimesh.transformations.rotation_matrix(-np.pi / 2, (0, 1, 0))
-    return np.asarray(matrix)
 
 
 def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> MeshPart:

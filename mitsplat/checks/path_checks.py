@@ -249,6 +249,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
         yield from _check_rest(scene)
     yield _check_view(scene)
     yield from _check_surfaces(scene)
+    yield from _list_mesh_sizes(scene)
     yield from _check_kernel(scene)
     drawn = (*scene.environments, *scene.assets)
     lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in drawn)
@@ -287,6 +288,17 @@ def _check_rest(scene: Scene) -> Iterator[Finding]:
         yield Finding("rest", False, str(error), "change what objects rest on, or their region")
     if rested:
         yield Finding("rest", True, f"{len(rested)} of the objects, each tried alone, come to rest")
+
+
+def _list_mesh_sizes(scene: Scene) -> Iterator[Finding]:
+    """List the sizes of shapes from mesh files, which show wrong units and axes."""
+    sizes = [
+        f"{shape.name} is {' x '.join(f'{extent:.3g}' for extent in mesh.extents)} m"
+        for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True)
+        if shape.mesh is not None
+    ]
+    if sizes:
+        yield Finding("shapes", True, "; ".join(sizes))
 
 
 def _check_surfaces(scene: Scene) -> Iterator[Finding]:

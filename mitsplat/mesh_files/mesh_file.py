@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import trimesh
 from PIL import Image
 
 from mitsplat.arrays import Float64Array, Int64Array
@@ -140,6 +141,33 @@ class MeshFile:
     warnings: tuple[str, ...] = ()
     in_single: bool = False
     tolerance: float | None = None
+
+
+@dataclass(frozen=True)
+class MeshFrame:
+    """Units and vertical axis of a mesh file; absent values are those that the file states.
+
+    Attributes:
+        metres_per_unit: Length of the unit [m]; 1 if neither this nor the file states it.
+        up: Axis that points up; z if neither this nor the file states it.
+    """
+
+    metres_per_unit: float | None = None
+    up: Axis | None = None
+
+    def to_world(self, stated_units: float | None = None, stated_up: Axis | None = None) -> Float64Array:
+        """Return the transform (4, 4) to metres with z up, for the values that a file states."""
+        return world_from_file(self.metres_per_unit or stated_units or 1.0, self.up or stated_up or "z")
+
+
+def world_from_file(metres_per_unit: float, up: Axis) -> Float64Array:
+    """Return the transform (4, 4) from the file's units and axes to metres, z up."""
+    matrix = np.diag([metres_per_unit, metres_per_unit, metres_per_unit, 1.0])
+    if up == "y":
+        matrix = matrix @ trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
+    elif up == "x":
+        matrix = matrix @ trimesh.transformations.rotation_matrix(-np.pi / 2, (0, 1, 0))
+    return np.asarray(matrix)
 
 
 def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:

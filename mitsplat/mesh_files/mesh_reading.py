@@ -11,7 +11,7 @@ import trimesh
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.untrusted_meshes import check_mesh, refuse_archive, try_read
 from mitsplat.mesh_files.gltf import read_gltf
-from mitsplat.mesh_files.mesh_file import MeshFile
+from mitsplat.mesh_files.mesh_file import MeshFile, MeshFrame
 from mitsplat.mesh_files.step import STEP_SUFFIXES, read_step
 from mitsplat.mesh_files.threemf import read_3mf
 from mitsplat.mesh_files.trimesh_files import read_with_trimesh
@@ -24,21 +24,24 @@ SCENE_SUFFIXES = (".glb", ".gltf", ".3mf", *STEP_SUFFIXES)
 _READERS = {".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf}
 
 
-def read_surface(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
-    """Read the geometry of a mesh file as one mesh, in the units and axes of the file.
+def read_surface(path: Path, *, merge: bool = True, frame: MeshFrame | None = None) -> trimesh.Trimesh:
+    """Read the geometry of a mesh file as one mesh.
 
     Args:
         path: The file.
         merge: Merge vertices at the same position.
+        frame: Convert to metres with z up; by default, the mesh has the units and axes of the file.
 
     Raises:
         InputError, MissingResourceError: As :func:`read_mesh_file`.
     """
-    meshes = []
-    for part in read_mesh_file(path, textures=False).parts:
+    meshes, file = [], read_mesh_file(path, textures=False)
+    for part in file.parts:
         mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
         meshes.append(mesh.apply_transform(part.transform))  # which reverses the faces of mirrored parts
     joined = trimesh.util.concatenate(meshes) if meshes else trimesh.Trimesh()
+    if frame is not None:
+        joined.apply_transform(frame.to_world(file.metres_per_unit, file.up))
     return trimesh.Trimesh(joined.vertices, joined.faces, process=merge)
 
 

@@ -16,6 +16,7 @@ import trimesh
 from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
 from mitsplat.errors import InputError
 from mitsplat.images.untrusted_images import check_images
+from mitsplat.mesh_files.mesh_file import MeshFrame
 from mitsplat.scene.loading.image_lists import WILDCARDS, glob_below, image_names, names_below
 from mitsplat.scene.loading.primitives import make_primitives
 from mitsplat.scene.spec.light_spec import EnvironmentLight
@@ -212,6 +213,6 @@ def shape_mesh(shape: Shape, folder: Path) -> trimesh.Trimesh:
         walls: trimesh.Trimesh = trimesh.boolean.union(list(bin_walls(shape.bin)))
         return walls
     if shape.box is None:
-        return read_mesh(folder / str(shape.mesh))
+        return read_mesh(folder / str(shape.mesh), frame=MeshFrame(shape.units, shape.up))
     box: trimesh.Trimesh = trimesh.creation.box(extents=shape.box.size, transform=pose_matrix(shape.box))
     return box

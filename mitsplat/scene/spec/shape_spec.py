@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, NonNegativeFloat, model_validator
 
 from mitsplat.scene.spec.material_spec import ColourMaterial, Material, NoiseMaterial
@@ -34,7 +36,19 @@ class Shape(StrictModel):
         None, description="Geometry: a box. A shape has exactly one of ``box``, ``bin`` and ``mesh``."
     )
     bin: Bin | None = Field(None, description="Geometry: an open bin.")
-    mesh: str | None = Field(None, description="Geometry: a mesh file, relative to the scene file, in world space [m].")
+    mesh: str | None = Field(None, description="Geometry: a mesh file in world space, relative to the scene file.")
+    units: Positive | None = Field(
+        None,
+        exclude_if=lambda units: units is None,
+        description="Metres per unit of ``mesh``, 0.001 for millimetres. By default stated by the file (STEP, glTF, "
+        "3MF, DAE), or 1.",
+    )
+    up: Literal["x", "y", "z"] | None = Field(
+        None,
+        exclude_if=lambda up: up is None,
+        description="Axis of ``mesh`` that points up. It becomes +z of the world. By default stated by the file "
+        "(glTF: y; 3MF: z; DAE), or z.",
+    )
     visible: bool = Field(False, description="The shape is rendered.")
     collider: bool = Field(True, description="The shape collides with objects.")
     proxy: bool = Field(
@@ -94,6 +108,9 @@ class Shape(StrictModel):
         if len(forms) != 1:
             got = " and ".join(forms) or "none"
             raise FieldError("name", f"shape {self.name!r} must have either a box, a bin or a mesh (got {got})")
+        for key in ("units", "up"):
+            if self.mesh is None and getattr(self, key) is not None:
+                raise FieldError(key, f"belongs to a mesh, which shape {self.name!r} has not")
         if not (self.visible or self.collider or self.proxy):
             raise FieldError("visible", f"shape {self.name!r} must be visible, a collider or a proxy")
         if self.materials and not self.visible:

@@ -34,7 +34,7 @@ from mitsplat.storage.cache import cache_folder
 from tests.forks import Forks
 
 if TYPE_CHECKING:
-    from mitsplat.capture.pipeline.capture_pipeline import CaptureResult
+    from mitsplat.capture.pipeline.capture_result import CaptureResult
 
 WriteScene = Callable[..., Path]
 

@@ -21,7 +21,8 @@ from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.photos import Prepared, mask_files, prepare_photos, read_mask, with_orientation
-from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_result import CaptureResult
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from tests import rendered

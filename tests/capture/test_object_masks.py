@@ -14,7 +14,8 @@ from PIL import Image
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.geometric_masks import agreed_masks, geometric_masks, object_masks, object_points
 from mitsplat.capture.isolation import ChosenObject
-from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, _reject_occluded
+from mitsplat.capture.pipeline.capture_pipeline import _reject_occluded
+from mitsplat.capture.pipeline.capture_result import CaptureResult
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import iou

@@ -41,7 +41,7 @@ from tests.conftest import box_asset
 from tests.forks import MITSPLAT, Forks
 
 if TYPE_CHECKING:
-    from mitsplat.capture.pipeline.capture_pipeline import CaptureResult
+    from mitsplat.capture.pipeline.capture_result import CaptureResult
 
 ROOT = Path(__file__).parents[2]
 TUTORIAL = ROOT / "docs/bin_picking.md"

@@ -15,7 +15,8 @@ import trimesh
 
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.pipeline.capture_pipeline import CaptureResult, CaptureSettings
+from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
+from mitsplat.capture.pipeline.capture_result import CaptureResult
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.gaussians.splat_cloud import Splats

@@ -23,10 +23,11 @@ from mitsplat.capture.isolation import ChosenObject, occluded_part
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.photo_masks import add_masks, check_borders, cutout_masks, given_masks, model_masks, plain_masks
 from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
+from mitsplat.capture.pipeline.capture_result import CaptureResult
 from mitsplat.capture.pipeline.overview import capture_sheet
 from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
-from mitsplat.capture.video import ChosenFrames, choose_frames
+from mitsplat.capture.video import choose_frames
 from mitsplat.errors import InputError, check_fields, check_type, path_of
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
@@ -34,11 +35,6 @@ from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import write_file, write_text
 
 MIN_PHOTOS = 3
-MIN_REGISTERED = 0.75
-"""Minimum fraction of registered photos for a successful capture."""
-
-FEW_POINTS = 3 * MIN_POINTS
-"""Number of observed points below which a camera causes a warning."""
 
 _HIDDEN = 0.03
 """Occluded fraction of the object above which the mask of a photo marks the occluded pixels as unknown."""
@@ -117,73 +113,6 @@ class CaptureSettings:
         for broken, rule in rules:
             if broken:
                 raise InputError(rule)
-
-
-@dataclass(frozen=True, eq=False)
-class CaptureResult:
-    """Result of the stage ``mitsplat capture``.
-
-    Attributes:
-        capture: Capture as stored in its folder.
-        given: Number of input photographs.
-        source: Origin of scale and gravity, as a clause.
-        reprojection_error: Mean reprojection error over all observations [px].
-        doubtful: Low fractions of matches that agree with the camera, by photo; without cameras that a board confirms.
-        video: Chosen video frames, or None for photographs.
-    """
-
-    capture: Capture
-    given: int
-    source: str
-    reprojection_error: float
-    doubtful: Mapping[str, float]
-    video: ChosenFrames | None = None
-
-    @property
-    def registered(self) -> float:
-        """Fraction of the input photos that are in the capture."""
-        return len(self.capture.photos) / self.given
-
-    @property
-    def exposure(self) -> str | None:
-        """Range of the corrected exposure differences as a clause; None without correction."""
-        gains = [np.log(photo.gain).mean() for photo in self.capture.photos if photo.gain is not None]
-        return f"photos differ by up to {np.expm1(np.ptp(gains)):.0%}; this is corrected" if gains else None
-
-    @property
-    def weak(self) -> dict[str, int]:
-        """Number of observed points of photos that observe too few, by name."""
-        counts = {photo.name: len(photo.seen) for photo in self.capture.photos}
-        return {name: count for name, count in counts.items() if count < FEW_POINTS}
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Warnings about photos in the capture, one sentence each."""
-        warnings = [] if self.video is None else [*self.video.warnings]
-        if self.doubtful:
-            shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
-            warnings.append(
-                f"cameras agree with few of their matches and may be wrong; remove these photos or add others: {shares}"
-            )
-        if not len(self.capture.points):
-            warnings.append(
-                "no point is seen alike by two photos with the cameras given, which may be wrong: are they of these "
-                "photos, and in the axes of their format (transforms.json: y up, z backwards)?"
-            )
-        elif self.weak:
-            warnings.append(f"few matched points; add photos with more overlap: {', '.join(self.weak)}")
-        return tuple(warnings)
-
-    @property
-    def shortcoming(self) -> str | None:
-        """Missed threshold and its remedy as a sentence, or None."""
-        if self.registered >= MIN_REGISTERED:
-            return None
-        return (
-            f"only {len(self.capture.photos)} of {self.given} photos ({self.registered:.0%}) could be used, "
-            f"{MIN_REGISTERED:.0%} are required: take sharp photos of one object at steps of about ten degrees, with "
-            "texture below it and even light"
-        )
 
 
 def capture_photos(

@@ -15,6 +15,10 @@ h / sqrt(h^2 + d^2) (Yong and Mahadevan, 2011, "Probability, geometry, and dynam
 rebounds, thin coins do so more rarely: an American nickel (h/d = 0.09) in one of about 6000 tosses (Murray and Teare,
 1993, "Probability of a tossed coin landing on edge"), and a coin of h/d = 1 in half of the tosses (Hernández-Navarro
 and Piñero, 2022, "Exact face-landing probabilities for bouncing objects").
+
+The formula of Yong and Mahadevan is the solid angle of the edge, as seen from the centre of mass. By the same argument,
+a hex nut that does not rebound rests on a side with the probability of the solid angle of its sides. Those of its
+chamfers may end flat or on a side.
 """
 
 from __future__ import annotations
@@ -58,6 +62,7 @@ SPACING = 0.5
 TIMESTEP, MAX_TIME = 0.002, 8.0
 REFERENCE_STEP, REFERENCE_TIME, CONTACT_TIME = 0.0005, 3.0, 0.003
 FRICTION, TABLE_FRICTION = 0.35, 0.5
+FLAT, EDGE = 0.9, 0.3  # smallest and largest cosine of the angle between the axis and the vertical
 
 
 @dataclass(frozen=True)
@@ -201,6 +206,23 @@ def drop_reference(batch: Batch) -> tuple[Float64Array, int]:
     return found, int((np.abs(data.qvel.reshape(-1, 6)[:, :3]).max(axis=1) > 0.05).sum())
 
 
+def solid_angles(part: Part) -> tuple[float, float]:
+    """Return the shares of the full solid angle that flat faces and edges of a part's hull take, seen from its centre.
+
+    A flat face or an edge has a normal as close to the axis, or to its plane, as a part that rests flat or on edge.
+    The solid angle of a triangle is that of van Oosterom and Strackee (1983, "The solid angle of a plane triangle").
+    """
+    hull = part.mesh.convex_hull
+    a, b, c = np.moveaxis(hull.triangles - part.mass.centre, 1, 0)
+    x, y, z = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    volumes = np.einsum("ni,ni->n", a, np.cross(b, c))
+    dots = (np.einsum("ni,ni->n", *pair) for pair in ((b, c), (a, c), (a, b)))
+    angles = 2 * np.arctan2(volumes, x * y * z + sum(dot * length for dot, length in zip(dots, (x, y, z), strict=True)))
+    along = np.abs(hull.face_normals @ part.axis)
+    flat, edge = (float(angles[chosen].sum() / angles.sum()) for chosen in (along > FLAT, along < EDGE))
+    return flat, edge
+
+
 def batches_of(names: Sequence[str], steppers: Sequence[str], drops: int, restitution: float) -> Iterator[Batch]:
     for part in names:
         for stepper in steppers:
@@ -219,7 +241,7 @@ def show(
     axis, table = make_part(name).axis, {}
     for stepper in up:
         along = np.abs(up[stepper] @ axis)
-        flat, edge, count = int((along > 0.9).sum()), int((along < 0.3).sum()), len(along)
+        flat, edge, count = int((along > FLAT).sum()), int((along < EDGE).sum()), len(along)
         interval = binomtest(edge, count).proportion_ci(method="wilson")
         table[stepper] = [flat, edge, count - flat - edge]
         each = seconds[stepper] / count
@@ -247,6 +269,12 @@ def show(
         rows = rows[:, rows.any(axis=0)]
         p = chi2_contingency(rows).pvalue if rows.shape[1] > 1 else 1.0
         figure(p, "", name, "p", first, second)
+    if name.startswith("hex_nut"):
+        flat_share, side_share = solid_angles(make_part(name))
+        figure((side_share, 1 - flat_share), "", name, "edge without rebound")
+        print(
+            f"{name:18} by solid angle on a side: {side_share:.2%} to {1 - flat_share:.2%} without rebound", flush=True
+        )
     if name.startswith("coin"):
         ratio = float(name.split()[1])
         expected = ratio / np.hypot(ratio, 1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chisquare
 
-from benchmarks.physics.drops import BATCH, Batch, drop_batch, make_part
+from benchmarks.physics.drops import BATCH, Batch, drop_batch, make_part, solid_angles
 
 
 def upward(part: str, drops: int, *, restitution: float = 0.5, stepper: str = "mujoco"):
@@ -33,6 +33,13 @@ def test_coins_that_rebound_rest_on_edge_more_rarely_than_the_formula_without_re
     The formula is that of Yong and Mahadevan (2011), "Probability, geometry, and dynamics in the toss of a thick coin".
     """
     assert on_edge("coin 0.35", 60) <= binom.ppf(0.01, 60, 0.35 / np.hypot(0.35, 1))
+
+
+@pytest.mark.parametrize("ratio", [0.35, 1.0])
+def test_solid_angles_of_a_coin_equal_the_formula_without_rebounds(ratio):
+    flat, edge = solid_angles(make_part(f"coin {ratio:g}"))
+    assert edge == pytest.approx(ratio / np.hypot(ratio, 1), abs=1e-3)
+    assert flat == pytest.approx(1 - edge, abs=1e-9)
 
 
 @pytest.mark.extended

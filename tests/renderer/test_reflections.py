@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +20,9 @@ from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
-from mitsplat.renderer.light.reflections import COLUMN_STEP, RAY_STEP, ROW_STEP
+from mitsplat.renderer.light.reflections import COLUMN_STEP, RAY_STEP, ROW_STEP, Reflections
 from mitsplat.renderer.light.shadow_rays import ROBERTS
+from mitsplat.renderer.materials.principled import typical_brightness
 from tests.renderer.test_bounce import mitsuba_camera
 from tests.renderer.test_light import WHITE_SKY, down_camera, floor, nothing, slab
 
@@ -246,6 +248,25 @@ def test_mirror_shows_an_object_at_its_image() -> None:
     seen = (light.light[..., 0] < 0.75) & floor_seen
     assert expected.sum() > 100
     assert (seen & expected).sum() / (seen | expected).sum() > 0.85
+
+
+@pytest.mark.parametrize("valid", [16, 8, 4])
+def test_variance_is_that_of_the_rays_that_start_at_a_surface(valid: int) -> None:
+    """At an outline, some points of a pixel miss the surface; the pixel shows the mean of the other points.
+
+    The mean of the estimated variances over many pixels is the variance of their brightness.
+    """
+    make_integrator()
+    pixels, rays = 50_000, 16
+    light = np.random.default_rng(0).lognormal(size=(pixels, rays)) * (np.arange(rays) < valid)
+    grey = mi.Color3f(mi.Float(light.ravel().astype(np.float32)))
+    brightness = np.array(typical_brightness(grey, mi.Color3f(0))).reshape(pixels, rays)
+    sums = [mi.Float(values.sum(axis=1).astype(np.float32)) for values in (light, brightness**2)]
+    every = Reflections(mi.Color3f(sums[0]), mi.Color3f(0), sums[1], dr.full(mi.Float, rays, pixels))
+    shown = every.of_valid(mi.Float(valid / rays))
+    assert np.allclose(np.array(shown.rays), valid)
+    expected = (brightness.sum(axis=1) / valid).var()
+    assert np.array(shown.variance).mean() == pytest.approx(expected, rel=0.05)
 
 
 def test_mirror_shows_captured_colours_of_its_directions() -> None:

@@ -440,12 +440,12 @@ class TracedPixels:
             lighting.reflectors,
             points.steps(dr.arange(mi.UInt32, dr.width(points.owner))),
         )
-        sums, estimate = gathered(self._trace_reflections(tracer, exposure), glossy), gathered(estimate, glossy)
-        per_point = dr.rcp(dr.maximum(dr.gather(mi.Float, points.valid_share, glossy), 1e-3))
-        weight = per_point / dr.maximum(estimate.rays, 1) * (dr.pi / lighting.white)
-        rays = dr.maximum(sums.rays, 1)
-        tinted = estimate.tinted * weight + sums.tinted * (per_point / rays)
-        colourless = estimate.colourless * weight + sums.colourless * (per_point / rays)
+        valid_share = dr.maximum(dr.gather(mi.Float, points.valid_share, glossy), 1e-3)
+        sums = gathered(self._trace_reflections(tracer, exposure), glossy).of_valid(valid_share)
+        estimate = gathered(estimate, glossy)
+        weight = dr.pi / (lighting.white * (dr.maximum(estimate.rays, 1) * valid_share))
+        tinted = estimate.tinted * weight + sums.tinted / sums.rays
+        colourless = estimate.colourless * weight + sums.colourless / sums.rays
         tinted, colourless = averaged_reflections(self.mirror_filter, tinted, colourless, sums.variance, self.mirrored)
         own, pixels = self.mirror_filter.here, self.mirror_filter.index
         before = dr.gather(mi.Color3f, light, pixels)

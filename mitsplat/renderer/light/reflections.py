@@ -8,7 +8,7 @@ follows the variance of the first rays, as for shadow rays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -61,6 +61,10 @@ class Reflections:
         rays = dr.maximum(self.rays, 1)
         mean = typical_brightness(self.tinted, self.colourless) / rays
         return dr.maximum(self.squares / rays - dr.square(mean), 0) / dr.maximum(rays - 1, 1)
+
+    def of_valid(self, share: mi.Float) -> Reflections:
+        """Return the sums with the number of rays that started at a surface, a ``share`` of all (at least one)."""
+        return replace(self, rays=dr.maximum(self.rays * share, 1))
 
     def add(self, places: mi.UInt32, more: Reflections) -> None:
         """Add the sums ``more`` of distinct ``places`` in place."""

@@ -219,7 +219,8 @@ class Reflectors:
         lane = dr.compress(near_objects)
         if dr.width(lane):
             some = (dr.gather(type(v), v, lane) for v in (captured, origin, normal, key))
-            dr.scatter_add(colour, self._reflected_onto_capture(static, dynamic, *some), lane)
+            added = self._reflected_onto_capture(static, dynamic, *some)
+            dr.scatter(colour, dr.gather(mi.Color3f, colour, lane) + added, lane)  # scatter_add compiles per size
         return colour
 
     def _reflected_onto_capture(

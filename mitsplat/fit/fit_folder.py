@@ -11,7 +11,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -68,6 +68,11 @@ class FitResult:
     def validation_psnr(self) -> float | None:
         """Mean PSNR of the validation photos [dB], or None without a target."""
         return _mean_psnr(self.validation) if self.validation else None
+
+
+def _read_held_out(photo: JsonObject) -> HeldOut:
+    """Read the fields of a photo and ignore fields that only older versions wrote."""
+    return HeldOut(**{field.name: photo[field.name] for field in fields(HeldOut)})
 
 
 def _mean_psnr(photos: Sequence[HeldOut]) -> float:
@@ -142,7 +147,7 @@ class FitFolder:
         record = read_record(path)
         try:
             held_out, validation = (
-                tuple(HeldOut(**photo) for photo in record[name]) for name in ("held_out", "validation")
+                tuple(_read_held_out(photo) for photo in record[name]) for name in ("held_out", "validation")
             )
             found, iterations, seconds = record["inputs"], int(record["iterations"]), float(record["seconds"])
             warnings = tuple(record["warnings"])

@@ -38,6 +38,7 @@ MODULES = (
     "geometry.hull_fit",
     "geometry.mesh",
     "geometry.mesh_distance",
+    "geometry.rigid",
     *(f"physics.{name}" for name in _PHYSICS_MODULES),
     "scene.planning.contents",
     "scene.planning.shape_poses",

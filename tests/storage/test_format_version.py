@@ -87,7 +87,7 @@ def test_captures_have_a_version_and_newer_ones_are_refused(tmp_path: Path) -> N
 
 
 def test_fits_have_a_version_and_newer_ones_are_refused(tmp_path: Path) -> None:
-    folder, held_out = FitFolder(tmp_path, "abc"), (HeldOut("a.png", 31.5, 0.9, 31.5, 32.0),)
+    folder, held_out = FitFolder(tmp_path, "abc"), (HeldOut("a.png", 31.5, 0.9, 31.5),)
     result = FitResult(box_asset("nut").splats, 5, 1.0, held_out, "abc")
     folder.save(result, {})
     state(tmp_path / "fit.json", ...)
@@ -101,6 +101,16 @@ def test_fits_have_a_version_and_newer_ones_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=rf"fit\.json: {NEWER}; --overwrite replaces it$"):
         folder.finished(overwrite=False)
     assert folder.finished(overwrite=True) is None
+
+
+def test_fits_with_fields_of_older_versions_are_read(tmp_path: Path) -> None:
+    folder, held_out = FitFolder(tmp_path, "abc"), (HeldOut("a.png", 31.5, 0.9, 31.5),)
+    folder.save(FitResult(box_asset("nut").splats, 5, 1.0, held_out, "abc"), {})
+    record = json.loads((tmp_path / "fit.json").read_text())
+    record["held_out"][0]["psnr_corrected"] = 32.0
+    (tmp_path / "fit.json").write_text(json.dumps(record))
+    found = folder.finished(overwrite=False)
+    assert found is not None and found.held_out == held_out
 
 
 @pytest.fixture

@@ -26,6 +26,9 @@ _Row = tuple[float, float, float, float]
 _Positive = Annotated[float, Field(gt=0)]
 
 
+MIN_REGISTERED = 0.75
+"""Minimum fraction of photos with a camera for a successful capture."""
+
 _MAX_COORDINATE = 1e9
 """Largest accepted coordinate of a camera or a point, in units of the model; geocentric coordinates in metres reach
 6e6.
@@ -117,8 +120,7 @@ def read_poses(
         sized = set(model.cameras)
     elif source.suffix == ".json":
         content = _parse_transforms(source)
-        # The paths are relative to the file.
-        paths = {frame.file_path: _below(source.resolve().parent, frame.file_path) for frame in content.frames}
+        paths = _frame_paths(source, content)
         names = match_names(source, paths, base, everything)
         sizes = {name: by_name[photo].size for name, photo in names.items() if photo in by_name}
         model, sized = _read_transforms(source, content, sizes)
@@ -142,6 +144,32 @@ def read_poses(
         return find_points([p for p in photos if p.file.name in cameras], cameras, folder, progress), photos
     seen = {photo.file.name: model.seen[name] for name, photo in matched.items()}
     return replace(model, cameras=cameras, seen=seen), photos
+
+
+def unnamed_photos(source: Path, photos: Sequence[str], base: Path) -> list[str]:
+    """Return the pictures that a ``transforms.json`` does not name, such as the depth maps in NeRF's synthetic data.
+
+    Args:
+        source: Source of the cameras. The folder of a COLMAP model names only the photos that COLMAP registered, so it
+            leaves out none.
+        photos: Pictures relative to their folder.
+        base: Folder of the pictures.
+
+    Returns:
+        None of them if pictures of many frames are missing, because names may be wrong then.
+    """
+    if source.is_dir() or source.suffix != ".json":
+        return []
+    paths = _frame_paths(source, _parse_transforms(source))
+    named = set(match_names(source, paths, base, photos).values())
+    if len(named) < MIN_REGISTERED * min(len(paths), len(photos)):
+        return []
+    return [photo for photo in photos if photo not in named]
+
+
+def _frame_paths(source: Path, content: _Transforms) -> dict[str, PurePosixPath]:
+    """Return the path of each image of a ``transforms.json``; its paths are relative to the file."""
+    return {frame.file_path: _below(source.resolve().parent, frame.file_path) for frame in content.frames}
 
 
 def _below(folder: Path, name: str) -> PurePosixPath:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -118,6 +118,7 @@ def prepare_photos(
     out: Path,
     *,
     but: Path | None = None,
+    skip: Collection[str] = (),
     max_size: int,
     upright: bool = True,
     masks: Path | None = None,
@@ -131,6 +132,7 @@ def prepare_photos(
     Args:
         folder: Folder of photographs, at any depth.
         but: Folder whose pictures are excluded.
+        skip: Names of pictures that are excluded.
         out: Folder of the copies; existing copies are reused.
         max_size: Longest edge of the copies [px].
         upright: Apply the EXIF orientation. Without it, cameras are known, and photos may be rendered: a plain
@@ -144,7 +146,7 @@ def prepare_photos(
     Raises:
         InputError: As :func:`find_photos`.
     """
-    files = find_photos(folder, but=but)
+    files = [path for path in find_photos(folder, but=but) if path.relative_to(folder).as_posix() not in skip]
     out.mkdir(parents=True, exist_ok=True)
     measured: list[_MeasuredPhoto] = []
     rejected: dict[str, str] = {}

@@ -20,7 +20,7 @@ from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
 from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.geometric_masks import object_masks, object_points
 from mitsplat.capture.isolation import ChosenObject, occluded_part
-from mitsplat.capture.known_poses import read_poses
+from mitsplat.capture.known_poses import read_poses, unnamed_photos
 from mitsplat.capture.photo_masks import add_masks, check_borders, cutout_masks, given_masks, model_masks, plain_masks
 from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
 from mitsplat.capture.pipeline.capture_result import CaptureResult
@@ -44,7 +44,7 @@ _MAX_HIDDEN = 0.5
 _INPUTS = "inputs.json"
 _PHOTOS = "sfm/photos.json"
 """Record of the inputs of the photo copies; written before the copies."""
-_RESULT_FIELDS = ("source", "reprojection_error", "doubtful")
+_RESULT_FIELDS = ("source", "reprojection_error", "doubtful", "unnamed")
 """Fields of a result that ``inputs.json`` stores in addition to the inputs."""
 
 
@@ -161,10 +161,13 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
     for marker in (_INPUTS, CAPTURE_FILE):  # images and masks will change
         (out / marker).unlink(missing_ok=True)
     _delete_outdated(out, inputs, settings)
+    names = [path.relative_to(photos).as_posix() for path in files]
+    unnamed = [] if settings.poses is None else unnamed_photos(settings.poses, names, photos)
     prepared, rejected = prepare_photos(
         photos,
         out / "images",
         but=settings.masks,
+        skip=set(unnamed),
         max_size=settings.max_size,
         upright=settings.poses is None,
         masks=settings.masks,
@@ -199,7 +202,8 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
             path.unlink()
     write_file(out / "capture.png", lambda part: capture_sheet(capture).save(part, "PNG"))
     doubtful = _doubtful_photos(model, frame, by_file, {photo.name for photo in capture.photos})
-    result = CaptureResult(capture, len(files), frame.source, model.reprojection_error, doubtful)
+    given_count = len(files) - len(unnamed)
+    result = CaptureResult(capture, given_count, frame.source, model.reprojection_error, doubtful, unnamed)
     record = {key: getattr(result, key) for key in _RESULT_FIELDS}
     write_text(out / _INPUTS, json.dumps({"inputs": inputs, **record}, indent=1))
     return result
@@ -277,7 +281,8 @@ def _load_finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None
         if record["inputs"] != inputs or not (out / "capture.png").is_file():
             return None
         capture = Capture.load(out)
-        return CaptureResult(capture, len(record["inputs"]["photos"]), **{key: record[key] for key in _RESULT_FIELDS})
+        stored = {key: record[key] for key in _RESULT_FIELDS}
+        return CaptureResult(capture, len(record["inputs"]["photos"]) - len(stored["unnamed"]), **stored)
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: recompute
         return None
 

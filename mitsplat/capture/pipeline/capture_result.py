@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mitsplat.capture.capture import Capture
+from mitsplat.capture.known_poses import MIN_REGISTERED
 from mitsplat.capture.structure_from_motion import MIN_POINTS
 from mitsplat.capture.video import ChosenFrames
 
-MIN_REGISTERED = 0.75
-"""Minimum fraction of registered photos for a successful capture."""
+_MAX_LISTED = 3
+"""Number of pictures that a warning lists."""
 
 FEW_POINTS = 3 * MIN_POINTS
 """Number of observed points below which a camera causes a warning."""
@@ -24,10 +25,11 @@ class CaptureResult:
 
     Attributes:
         capture: Capture as stored in its folder.
-        given: Number of input photographs.
+        given: Number of input photographs, without those in ``unnamed``.
         source: Origin of scale and gravity, as a clause.
         reprojection_error: Mean reprojection error over all observations [px].
         doubtful: Low fractions of matches that agree with the camera, by photo; without cameras that a board confirms.
+        unnamed: Pictures in the folder that the given ``transforms.json`` does not name; they are left out.
         video: Chosen video frames, or None for photographs.
     """
 
@@ -36,6 +38,7 @@ class CaptureResult:
     source: str
     reprojection_error: float
     doubtful: Mapping[str, float]
+    unnamed: Sequence[str] = ()
     video: ChosenFrames | None = None
 
     @property
@@ -59,6 +62,12 @@ class CaptureResult:
     def warnings(self) -> tuple[str, ...]:
         """Warnings about photos in the capture, one sentence each."""
         warnings = [] if self.video is None else [*self.video.warnings]
+        if self.unnamed:
+            others = f" and {more} more" if (more := len(self.unnamed) - _MAX_LISTED) > 0 else ""
+            warnings.append(
+                f"the poses do not name {len(self.unnamed)} pictures in the folder, which are left out: "
+                f"{', '.join(self.unnamed[:_MAX_LISTED])}{others}"
+            )
         if self.doubtful:
             shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
             warnings.append(

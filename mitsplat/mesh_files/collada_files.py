@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -13,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mitsplat.errors import InputError
-from mitsplat.mesh_files.mesh_file import OPAQUE, Axis
+from mitsplat.mesh_files.mesh_file import OPAQUE, Axis, Material, phong_gloss
 from mitsplat.mesh_files.obj_files import check_texture
 
 _NAMESPACE = "{*}"
@@ -127,6 +128,51 @@ def _check_coordinates(material: Any, primitive: Any) -> None:
 def lost_node(document: Any) -> str | None:
     """Return the reason why a node of the scene of a ``collada.Collada`` was left out, or None if all were read."""
     return next((str(error.msg) for error in document.errors if _LOST_NODE.match(error.msg)), None)
+
+
+def collada_effects(document: Any) -> list[Any]:
+    """Return the effect of each group of faces of a ``collada.Collada``, in the order of trimesh; None without one."""
+    from collada import polylist, triangleset  # optional
+
+    return [
+        None if material is None else material.target.effect
+        for material, primitive in _bindings(document.scene.nodes)
+        if isinstance(primitive, polylist.Polylist | triangleset.TriangleSet) and primitive.vertex is not None
+    ]
+
+
+def with_gloss(material: Material, effect: Any) -> Material:
+    """Return a material with the highlight of an effect, which trimesh leaves out.
+
+    ``lambert`` and ``constant`` have none. Mirrored surroundings (``reflective``) are left out with a warning.
+    """
+    specular, roughness, warnings = 0.0, 1.0, list(material.warnings)
+    if effect.shadingtype in ("phong", "blinn"):
+        highlight = _mean(effect.specular)
+        if highlight is None:
+            warnings.append("its texture of highlights is left out")
+        exponent = None if effect.shininess is None else _mean(effect.shininess)
+        specular, roughness = phong_gloss(0.5 if highlight is None else highlight, exponent)
+    if (_mean(effect.reflective) or 0.0) * (_mean(effect.reflectivity) or 0.0) > 0:
+        warnings.append("it mirrors its surroundings (reflectivity), which is left out")
+    shiny = specular > 0
+    return replace(
+        material,
+        specular=specular,
+        shiny=shiny,
+        roughness=roughness if shiny else 1.0,
+        warnings=tuple(warnings),
+    )
+
+
+def _mean(value: Any) -> float | None:
+    """Return the mean of a colour without its opacity, or a number; 0 if it is absent and None if it is a texture."""
+    if value is None:
+        return 0.0
+    try:
+        return float(np.atleast_1d(np.asarray(value, dtype=np.float64))[:3].mean())
+    except (TypeError, ValueError):
+        return None
 
 
 def collada_warnings(document: Any) -> Iterator[str]:

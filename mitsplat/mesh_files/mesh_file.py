@@ -27,6 +27,8 @@ UNKNOWN_COLOUR = 0.5
 """Linear grey of parts without a colour."""
 ROUGHNESS = 0.6
 LEAST_ROUGHNESS = 0.05
+_FULL_SPECULAR = 0.08
+"""Reflectance at normal incidence of a white specular colour."""
 OPAQUE = 0.999
 MAX_FRACTION = 1.01
 """Largest number that counts as a colour from 0 to 1."""
@@ -91,6 +93,20 @@ class Material:
     warnings: tuple[str, ...] = ()
     metallic_roughness: Texture | None = None
     normal_map: Texture | None = None
+
+
+def phong_gloss(highlight: float, exponent: float | None) -> tuple[float, float]:
+    """Return reflectance at normal incidence and roughness of the highlight that MTL and COLLADA state.
+
+    Args:
+        highlight: Mean of the specular colour.
+        exponent: Phong's exponent, or None if the file states none.
+    """
+    specular = _FULL_SPECULAR * min(1.0, highlight)
+    if exponent is None:
+        return specular, ROUGHNESS
+    # Converted to the slope variance of a microfacet surface (Walter et al. 2007).
+    return specular, float(np.clip((2.0 / (max(0.0, exponent) + 2.0)) ** 0.25, LEAST_ROUGHNESS, 1.0))
 
 
 UNKNOWN_MATERIAL = Material(np.full(3, UNKNOWN_COLOUR), None, shiny=False)

@@ -29,7 +29,15 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.mesh import check_faces
 from mitsplat.images.colour import decode_srgb
-from mitsplat.mesh_files.collada_files import check_collada, collada_warnings, lost_node, plain_name, read_collada_asset
+from mitsplat.mesh_files.collada_files import (
+    check_collada,
+    collada_effects,
+    collada_warnings,
+    lost_node,
+    plain_name,
+    read_collada_asset,
+    with_gloss,
+)
 from mitsplat.mesh_files.face_polygons import Polygon, has_concave, plain_obj, split_polygons
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import (
@@ -51,12 +59,11 @@ from mitsplat.mesh_files.mesh_file import (
     gloss_texture,
     is_transparent,
     means_of,
+    phong_gloss,
     pixels_of,
 )
 from mitsplat.mesh_files.obj_files import check_obj_materials, check_texture, obj_warnings, plain_text, values_of
 
-_FULL_SPECULAR = 0.08
-"""Reflectance at normal incidence of ``Ks`` 1."""
 _TRIMESH_DIFFUSE = (102, 102, 102)
 """Value that trimesh inserts for an absent ``Kd``."""
 _MAX_HEADER_BYTES = 1 << 16
@@ -117,13 +124,19 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
     if (lost := lost_node(document)) is not None:
         raise InputError(f"one of its nodes cannot be read ({lost}): export it again with all materials")
     units, up = read_collada_asset(path)
-    parts = tuple(part if part.material in _NO_MATERIALS else _decoded(part) for part in parts)
+    effects = dict(zip(scene.geometry, collada_effects(document), strict=True))
+    parts = tuple(
+        part
+        if (effect := effects[part.name]) is None or part.material in _NO_MATERIALS
+        else replace(part, material=with_gloss(_decoded(part.material), effect))
+        for part in parts
+    )
     return MeshFile(parts, units, up, tuple(collada_warnings(document)))
 
 
-def _decoded(part: FilePart) -> FilePart:
-    """Return a part whose display-encoded factor was read as a linear one, as trimesh does, with the linear factor."""
-    return replace(part, material=replace(part.material, factor=decode_srgb(part.material.factor)))
+def _decoded(material: Material) -> Material:
+    """Return a material of trimesh, which reads display-encoded factors as linear ones, with the linear factor."""
+    return replace(material, factor=decode_srgb(material.factor))
 
 
 def _plain_content(path: Path) -> bytes | None:
@@ -421,24 +434,23 @@ def _read_mtl(source: SimpleMaterial, uv: Float64Array | None) -> Material:
     given_roughness, metallic = _numbers(keys, "pr"), _numbers(keys, "pm")
     highlight, illumination = _numbers(keys, "ks"), _numbers(keys, "illum")
     physical = given_roughness is not None or metallic is not None
-    specular = 0.0 if highlight is None else _FULL_SPECULAR * min(1.0, float(highlight.mean()))
+    exponent = _numbers(keys, "ns")
+    specular, roughness = phong_gloss(
+        0.0 if highlight is None else float(highlight.mean()), None if exponent is None else float(exponent[0])
+    )
     if illumination is not None and illumination[0] < 2 and not physical:
         specular = 0.0
     if physical and highlight is None:
         specular = DIELECTRIC_SPECULAR
-    roughness = ROUGHNESS
     if given_roughness is not None:
-        roughness = float(given_roughness[0])
-    elif (exponent := _numbers(keys, "ns")) is not None:
-        # Phong's exponent, converted to the slope variance of a microfacet surface (Walter et al. 2007).
-        roughness = (2.0 / (max(0.0, float(exponent[0])) + 2.0)) ** 0.25
+        roughness = float(np.clip(given_roughness[0], LEAST_ROUGHNESS, 1.0))
     metal = 0.0 if metallic is None else float(np.clip(metallic[0], 0.0, 1.0))
     shiny = specular > 0 or metal > 0
     return Material(
         factor,
         texture,
         metal,
-        float(np.clip(roughness, LEAST_ROUGHNESS, 1.0)) if shiny else 1.0,
+        roughness if shiny else 1.0,
         specular,
         shiny,
         tuple(warnings),

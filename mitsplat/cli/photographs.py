@@ -448,8 +448,6 @@ def _print_result(done: AssetResult) -> None:
     typer.echo(f"splats: {found.gaussians}; mesh: {found.faces} faces, {closed}")
     for what, text in found.rows.items():
         typer.echo(f"{what[0].lower()}{what[1:]}: {text}")
-    if found.refinement is not None:
-        typer.echo(f"refinement: {found.refinement}")
     figures = {
         "held-out PSNR": None if found.psnr is None else f"{found.psnr:.2f} dB",
         "IoU with held-out masks": None

@@ -21,7 +21,6 @@ from mitsplat.images.colour import encode_srgb
 from mitsplat.quality import resolve_quality
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation
-from mitsplat.reconstruct.silhouette_refinement import RefinedMesh
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
 
 VERDICT_FILE = "verdict.json"
@@ -133,7 +132,6 @@ class Verdict:
         faces: Number of faces of the mesh.
         watertight: True if the mesh encloses a volume.
         solid: True if the mesh must enclose a volume, as that of an object.
-        refinement: Result of the mesh refinement as one clause, or None if it was not requested.
         causes: Measured causes in the photos, one clause each, by the threshold that they affect.
         surface: Source of the reconstructed mesh of an object, or None.
         surface_faults: Reasons why finer surfaces were rejected, one clause each.
@@ -156,7 +154,6 @@ class Verdict:
     faces: int
     watertight: bool
     solid: bool
-    refinement: str | None = None
     causes: Mapping[str, str] = field(default_factory=dict)
     surface: str | None = None
     surface_faults: tuple[str, ...] = ()
@@ -249,7 +246,6 @@ def compute_verdict(
     *,
     isolation: Isolation | None,
     psnr: float | None,
-    refinement: RefinedMesh | None = None,
     causes: Mapping[str, str] | None = None,
 ) -> Verdict:
     """Compute the quality figures from held-out views of splats and mesh."""
@@ -274,7 +270,6 @@ def compute_verdict(
         faces=0 if mesh is None else len(mesh.faces),
         watertight=mesh is not None and is_closed(mesh),
         solid=isolation is not None,
-        refinement=None if refinement is None else str(refinement),
         causes=causes or {},
     )
 

@@ -68,7 +68,6 @@ def _verdict(result: Reconstruction) -> str:
         "Mesh": f"{found.faces} faces, {'watertight' if found.watertight else 'open'}, "
         f"convex pieces: {len(result.asset.pieces)}",
         "Surface": found.surface,
-        "Refinement of the mesh": found.refinement,
     }
     if result.isolation is not None:
         removed = result.isolation

@@ -14,7 +14,7 @@ Turns about the principal axes that nearly map the mesh to itself are therefore 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -32,14 +32,12 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.segment_splats import MaskedView
-from mitsplat.reconstruct.silhouette_refinement import is_gain
+from mitsplat.reconstruct.silhouette_refinement import Refinement, is_gain
 from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
 from mitsplat.runtime.variant import ensure_variant
 
 _VALIDATION_EVERY = 3
 """Interval of the validation views."""
-_MIN_VIEWS = 6
-"""Least number of views for a refinement, a third of which are validation views."""
 _ROUNDS, _STEPS = 12, 20
 """Largest number of solutions, each with new outlines, and of evaluations in a solution."""
 _POINTS = 250
@@ -74,33 +72,15 @@ _EXACT = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class RefinedPose:
+class RefinedPose(Refinement):
     """Result of a pose refinement.
 
     Attributes:
         motion: Similarity transform of the mesh to its refined pose, shape (4, 4); the identity if it was rejected.
-        kept: True if the refined pose was accepted.
-        before, after: Mean IoU of the silhouettes with the masks of the validation views.
-        validation_views: Number of validation views; 0 if there were too few views.
     """
 
-    motion: Float64Array
-    kept: bool
-    before: float
-    after: float
-    validation_views: int
-
-    def __str__(self) -> str:
-        """Return the result as one clause."""
-        if not self.validation_views:
-            return f"as registered, because a refinement needs masks from {_MIN_VIEWS} positions outside the mesh"
-        photos = f"the masks of {self.validation_views} validation photos"
-        if self.kept:
-            return f"refined by the masks, IoU with {photos} {self.before:.3f} before and {self.after:.3f} after"
-        return (
-            f"as registered, IoU with {photos} {self.before:.3f}, and not significantly better after a refinement "
-            f"({self.after:.3f})"
-        )
+    least_views = 6
+    motion: Float64Array = field(kw_only=True)
 
 
 def refine_pose(
@@ -124,8 +104,8 @@ def refine_pose(
         for view in views
         if np.linalg.norm(view.camera.centre - frame.middle) > 1.2 * frame.radius and _contours(view.mask)
     ]
-    if len(outlines) < _MIN_VIEWS:
-        return RefinedPose(np.eye(4), False, np.nan, np.nan, 0)
+    if len(outlines) < RefinedPose.least_views:
+        return RefinedPose(False, motion=np.eye(4))
     validation = outlines[_VALIDATION_EVERY // 2 :: _VALIDATION_EVERY]
     training = [view for view in outlines if view not in validation]
     silhouettes = _Silhouettes(mesh)
@@ -140,7 +120,7 @@ def refine_pose(
     before = _overlaps(validation, silhouettes, np.eye(4))
     motion, misfit = _solve(training, silhouettes, frame, limits, _ROUNDS)
     after = _overlaps(validation, silhouettes, motion)
-    kept = is_gain(after - before, 1.0)
+    kept = is_gain(after - before)
     report_progress(1)
     misfits = []
     for number, start in enumerate(turned):
@@ -152,7 +132,8 @@ def refine_pose(
         if turned_misfit < _TURN_MISFIT * misfit and is_gain(overlaps - (after if kept else before), _TURN_GAIN):
             motion, after, kept = turned_motion, overlaps, True
     report_progress(len(turned) + 2)
-    return RefinedPose(motion if kept else np.eye(4), kept, float(before.mean()), float(after.mean()), len(validation))
+    motion = motion if kept else np.eye(4)
+    return RefinedPose(kept, float(before.mean()), float(after.mean()), len(validation), motion=motion)
 
 
 def _solve(

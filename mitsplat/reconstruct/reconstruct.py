@@ -205,13 +205,11 @@ def reconstruct_asset(
     if progress is not None:
         progress(0, 1, "evaluating held-out photos")
     held_out = show_held_out(splats, mesh, capture.held_out, settings.verdict_size)
-    verdict = compute_verdict(
-        capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, refinement=refinement, causes=causes
-    )
+    verdict = compute_verdict(capture, splats, mesh, held_out, isolation=isolation, psnr=psnr, causes=causes)
     if proxy is not None:
         verdict = replace(verdict, surface=proxy.source, surface_faults=proxy.faults)
-    if pose is not None:
-        verdict = replace(verdict, rows={"Pose of the mesh": str(pose)})
+    refined = {"Refinement of the mesh": refinement, "Pose of the mesh": pose}
+    verdict = replace(verdict, rows={name: str(one) for name, one in refined.items() if one is not None})
     asset = Asset(
         name=job.name,
         class_name=job.class_name or job.name,

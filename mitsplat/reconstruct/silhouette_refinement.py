@@ -18,7 +18,8 @@ diagonal.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import cv2
 import drjit as dr
@@ -40,8 +41,6 @@ _VIEW_RADIUS = 1.1
 """Radius that a view shows around the centre of the mesh, in radii of the mesh."""
 _VALIDATION_EVERY = 6
 """Interval of the validation views; smaller for few views, so that there are at least two of four and three of more."""
-_MIN_VIEWS = 4
-"""Least number of views for a refinement."""
 _BATCH = 2
 """Views per step."""
 _VALIDATIONS = 10
@@ -83,37 +82,45 @@ class MeshRefineSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class RefinedMesh:
-    """Result of a refinement.
+class Refinement:
+    """Comparison of silhouettes before and after a refinement with masks that were not fitted.
 
     Attributes:
-        mesh: The refined mesh if it was accepted, or the given mesh.
-        kept: True if the refined mesh was accepted.
-        before: Mean of 1 - IoU between the silhouettes of the given mesh and the masks of the validation views.
-        after: The same of the best refined mesh; infinite if none was valid. The best mesh is selected by these views,
-            so other views may differ by slightly more. A verdict uses photos that affected nothing.
+        kept: True if the refined mesh or pose was accepted.
+        before, after: Mean IoU of the silhouettes with the masks of the validation views. The best result is selected
+            by these views, so other views may differ by slightly more. ``after`` is not finite if no result was valid.
         validation_views: Number of validation views; 0 if there were too few views.
     """
 
-    mesh: trimesh.Trimesh
+    least_views: ClassVar[int]
     kept: bool
-    before: float
-    after: float
-    validation_views: int
+    before: float = np.nan
+    after: float = np.nan
+    validation_views: int = 0
 
     def __str__(self) -> str:
         """Return the result as one clause."""
         if not self.validation_views:
-            return f"rejected: refinement needs masks from {_MIN_VIEWS} positions outside the mesh"
+            return f"rejected (a refinement needs masks from {self.least_views} positions outside the mesh)"
         if not np.isfinite(self.after):
-            return "rejected: the refined mesh is invalid"
-        outcome = (
-            "accepted" if self.kept else "rejected" if self.after >= self.before else "rejected, as not significant"
-        )
+            return "rejected (the refined mesh is invalid)"
+        outcome = "accepted" if self.kept else "rejected, as not significantly better"
         return (
-            f"{outcome}: silhouettes and masks of the {self.validation_views} validation photos differ by "
-            f"{self.before:.2%} of the object before and by {self.after:.2%} after"
+            f"{outcome} (IoU with the masks of {self.validation_views} validation photos: {self.before:.4f} before, "
+            f"{self.after:.4f} after)"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedMesh(Refinement):
+    """Result of a mesh refinement.
+
+    Attributes:
+        mesh: The refined mesh if it was accepted, or the given mesh.
+    """
+
+    least_views = 4
+    mesh: trimesh.Trimesh = field(kw_only=True)
 
 
 def refine_mesh(
@@ -127,8 +134,8 @@ def refine_mesh(
     """Move the vertices of a mesh so that its silhouettes match masks.
 
     Every sixth view, or more if there are few, is a validation view and is not fitted. The best mesh on the way is
-    accepted if its validation error is below that of the given mesh by more than the standard error of the mean over
-    these views. A given mesh that was made from all masks has an advantage. The faces stay the same; no face folds over
+    accepted if its mean IoU with the masks of these views exceeds that of the given mesh by more than its standard
+    error. A given mesh that was made from all masks has an advantage. The faces stay the same; no face folds over
     or newly intersects another.
 
     Args:
@@ -143,8 +150,8 @@ def refine_mesh(
     middle = mesh.bounds.mean(axis=0)
     radius = float(np.linalg.norm(mesh.vertices - middle, axis=1).max())
     outside = [view for view in views if np.linalg.norm(view.camera.centre - middle) > 1.05 * _VIEW_RADIUS * radius]
-    if len(outside) < _MIN_VIEWS:
-        return RefinedMesh(mesh, False, np.inf, np.inf, 0)
+    if len(outside) < RefinedMesh.least_views:
+        return RefinedMesh(False, mesh=mesh)
     outlines = [Outline(view, middle, radius, settings.size) for view in outside]
     every = min(_VALIDATION_EVERY, max(2, len(outlines) // 3))
     validation = outlines[every // 2 :: every]
@@ -166,8 +173,8 @@ def refine_mesh(
         return dr.ravel(vertices)
 
     rng = np.random.default_rng(settings.seed)
-    before = scene.errors(start.vertices, validation)
-    refined, after = start.vertices, np.full(len(validation), np.inf)
+    before = scene.overlaps(start.vertices, validation)
+    refined, after = start.vertices, np.full(len(validation), -np.inf)
     for step in range(settings.steps):
         descent.set_learning_rate(settings.rate * (1 - step / settings.steps))
         chosen = rng.choice(len(training), min(_BATCH, len(training)), replace=False)
@@ -175,14 +182,14 @@ def refine_mesh(
         descent.step()
         if (step + 1) % max(1, settings.steps // _VALIDATIONS) == 0 or step + 1 == settings.steps:
             found = limit_motion(start, np.array(dr.detach(moved()), dtype=np.float64).reshape(-1, 3))
-            if found is not None and (errors := scene.errors(found, validation)).mean() < after.mean():
-                refined, after = found, errors
+            if found is not None and (overlaps := scene.overlaps(found, validation)).mean() > after.mean():
+                refined, after = found, overlaps
         if progress is not None:
             progress(step + 1, settings.steps, "refining the mesh")
-    kept = is_gain(before - after)
+    kept = is_gain(after - before)
     if kept:
         mesh = trimesh.Trimesh(refined * radius + middle, mesh.faces, process=False)
-    return RefinedMesh(mesh, kept, float(before.mean()), float(after.mean()), len(validation))
+    return RefinedMesh(kept, float(before.mean()), float(after.mean()), len(validation), mesh=mesh)
 
 
 def is_gain(gains: Float64Array, least: float = 1.0) -> bool:
@@ -248,15 +255,15 @@ class Silhouettes:
             total += dr.mean(dr.square(shown - view.mask) * view.known)
         return total
 
-    def errors(self, vertices: Float64Array, views: Sequence[Outline]) -> Float64Array:
-        """Return 1 - IoU of silhouette and mask per view, computed with fractional pixel coverage."""
+    def overlaps(self, vertices: Float64Array, views: Sequence[Outline]) -> Float64Array:
+        """Return the IoU of silhouette and mask per view, computed with fractional pixel coverage."""
         self.set_vertices(wrapped(mi.Float, vertices.ravel().astype(np.float32)))
-        errors = []
+        overlaps = []
         for view in views:
             shown = self.render(view, 4 * _SAMPLES, 0)
             both, either = (dr.sum(pick(shown, view.mask) * view.known)[0] for pick in (dr.minimum, dr.maximum))
-            errors.append(1 - both / max(either, 1e-9))
-        return np.array(errors, dtype=np.float64)
+            overlaps.append(both / max(either, 1e-9))
+        return np.array(overlaps, dtype=np.float64)
 
     def set_vertices(self, vertices: mi.Float) -> None:
         """Set the vertex positions."""

@@ -79,7 +79,7 @@ def test_a_displaced_part_returns_to_its_pose(bracket: trimesh.Trimesh, size: fl
     assert np.cbrt(np.linalg.det(result[:3, :3])) == pytest.approx(1, abs=1e-9 if size == 1 else 1e-3)
     assert found.after > 0.95 and found.after > found.before + 0.1
     assert told and told[0][2] == "refining the pose of the mesh"
-    assert str(found).startswith("refined by the masks, IoU with the masks of 4 validation photos 0.")
+    assert str(found).startswith("accepted (IoU with the masks of 4 validation photos: 0.")
 
 
 def test_a_ring_returns_to_its_surface_at_any_angle() -> None:
@@ -161,7 +161,7 @@ def test_the_registered_pose_is_kept_if_validation_photos_contradict(
     found = refine_pose(bracket, mixed, rigid=True)
     assert not found.kept and found.after < found.before
     np.testing.assert_array_equal(found.motion, np.eye(4))
-    assert "as registered, IoU with the masks of 4 validation photos 0." in str(found)
+    assert "rejected, as not significantly better (IoU with the masks of 4 validation photos: 0." in str(found)
 
 
 def test_a_true_pose_is_not_made_worse(bracket: trimesh.Trimesh, views: list[MaskedView]) -> None:
@@ -176,7 +176,7 @@ def test_few_or_useless_views_refine_nothing(bracket: trimesh.Trimesh, views: li
     useless = [*views[:5], MaskedView(inside, views[0].mask), replace(views[5], mask=np.zeros_like(views[5].mask))]
     found = refine_pose(bracket, useless, rigid=True)
     assert (found.kept, found.validation_views) == (False, 0)
-    assert str(found) == "as registered, because a refinement needs masks from 6 positions outside the mesh"
+    assert str(found) == "rejected (a refinement needs masks from 6 positions outside the mesh)"
 
 
 def test_an_open_mesh_with_separate_triangles_has_an_outline(views: list[MaskedView], bracket: trimesh.Trimesh) -> None:
@@ -208,7 +208,7 @@ def test_assets_have_the_refined_pose(
     start[:3, 3] = (1.5e-3, -1e-3, 1e-3)
     known_object.splats.transformed(start).save(tmp_path / "splats.ply")
     done = make_asset(known_object.capture, tmp_path / "splats.ply", tmp_path / "asset", job)
-    assert done.verdict.rows["Pose of the mesh"].startswith("refined by the masks, IoU with the masks of 9 validation")
+    assert done.verdict.rows["Pose of the mesh"].startswith("accepted (IoU with the masks of 9 validation")
     assert "Pose of the mesh" in (tmp_path / "asset/report.html").read_text()
     alignment = json.loads((tmp_path / "asset/verdict.json").read_text())["alignment"]
     assert job.imported is not None

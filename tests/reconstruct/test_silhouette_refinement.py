@@ -72,7 +72,7 @@ def test_a_disturbed_mesh_is_refined_to_the_solid(
     start = bumpy(bumps, scale)
     told: list[tuple[int, int, str]] = []
     found = refine_mesh(start, views, settings, progress=lambda *step: told.append(step))
-    assert found.kept and found.after < found.before
+    assert found.kept and found.after > found.before
     assert (found.validation_views, told[-1]) == (4, (40, 40, "refining the mesh"))
     assert chamfer(start, truth) > factor * chamfer(found.mesh, truth)
     assert overlap(found.mesh, truth) > overlap(start, truth)
@@ -99,8 +99,8 @@ def test_a_refinement_that_held_out_photos_contradict_is_rejected(
     found = refine_mesh(truth, conflicting, replace(QUICK, steps=20))
     assert not found.kept
     assert found.mesh is truth
-    assert found.after > found.before
-    assert str(found).startswith("rejected: silhouettes and masks of the 4 validation photos differ by ")
+    assert found.after < found.before
+    assert str(found).startswith("rejected, as not significantly better (IoU with the masks of 4 validation photos: 0.")
 
 
 def test_refinement_keeps_the_base_on_the_table() -> None:
@@ -187,7 +187,7 @@ def test_at_least_two_views_judge_and_fewer_than_four_are_refused(
     truth: trimesh.Trimesh, views: list[MaskedView]
 ) -> None:
     found = refine_mesh(truth, views[:3], QUICK)
-    assert found.mesh is truth and str(found) == "rejected: refinement needs masks from 4 positions outside the mesh"
+    assert found.mesh is truth and str(found) == "rejected (a refinement needs masks from 4 positions outside the mesh)"
     for count, judges in ((4, 2), (9, 3)):
         assert refine_mesh(truth, views[:count], replace(QUICK, steps=1)).validation_views == judges
 
@@ -200,7 +200,7 @@ def test_assets_record_the_result_of_the_refinement(
     settings = replace(SETTINGS, surface=surface, view_size=64, verdict_size=64, refine=replace(QUICK, steps=1))
     found = reconstruct_asset(known_object.capture, known_object.splats, AssetJob("part", settings=settings))
     assert found.refinement is not None
-    assert found.verdict.refinement == str(found.refinement)
+    assert found.verdict.rows == {"Refinement of the mesh": str(found.refinement)}
     page = write_asset_report(tmp_path_factory.mktemp("page"), known_object.capture, found).read_text()
     assert "Refinement of the mesh" in page and str(found.refinement) in page
     for other in ({"kind": "environment"}, {"imported": ImportedMesh(known_object.mesh)}):

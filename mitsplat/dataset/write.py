@@ -91,7 +91,6 @@ def write_dataset(
     shard: Shard | None = None,
     workers: int | None = 1,
     cluster: Cluster | None = None,
-    resume: bool = True,
     overwrite: bool = False,
     progress: Progress | None = None,
     render: Render | None = None,
@@ -101,9 +100,9 @@ def write_dataset(
 ) -> DatasetSummary:
     """Render the first ``frames`` frames of a scene (default: all) into the dataset folder ``out``.
 
-    Existing frames are reused if ``resume`` is set and they come from the same scene. The bytes of images, labels and
-    manifest do not depend on ``workers``, ``cluster`` or interruptions. The bytes of merged shards do not depend on the
-    number of shards. The bytes depend on the kind of device: pictures of a GPU differ a little from those of a CPU.
+    Existing frames of the same scene are reused. The bytes of images, labels and manifest do not depend on
+    ``workers``, ``cluster`` or interruptions. The bytes of merged shards do not depend on the number of shards. The
+    bytes depend on the kind of device: pictures of a GPU differ a little from those of a CPU.
 
     Args:
         scene: Scene to render; image size, formats and the seed are in ``scene.spec``.
@@ -113,7 +112,6 @@ def write_dataset(
         workers: Number of processes that render frames, see :func:`mitsplat.engine.pool.run_frames`. None selects the
             number that is worthwhile on this machine, or that fits into the cluster.
         cluster: Cluster that renders the frames; processes of this machine if None.
-        resume: Continue an existing dataset; if False, an existing dataset is an error.
         overwrite: Remove a dataset that is already in the folder.
         progress: Callback that is called after every finished frame and during slow steps.
         render: Replacement of :func:`mitsplat.frames.frame.render_frame`.
@@ -156,7 +154,7 @@ def write_dataset(
     content = content_of(scene, catalogue, used_device.kind)
     part = None if shard is None else shard.to_json(count)
     with open_folder(
-        out, content, scene.path, part, resume=resume, overwrite=overwrite, any_device=any_device
+        out, content, scene.path, part, resume=True, overwrite=overwrite, any_device=any_device
     ) as manifest:
         layouts: dict[int, list[int]] = {}
         for index in indices:

@@ -344,10 +344,6 @@ class TestRefusals:
         assert len(list(out.rglob("*.png"))) == 2
         assert not (out / "annotations").exists()
 
-    def test_an_existing_dataset_is_refused_without_resume(self, scene, tmp_path):
-        write(scene, tmp_path / "out", frames=1)
-        self.refuse(scene, tmp_path / "out", "already holds a dataset", resume=False)
-
     @pytest.mark.parametrize("overwrite", [False, True])
     @pytest.mark.parametrize("files", [["thesis.tex"], ["images/train/1.png", "labels/train/1.txt", "data.yaml"]])
     def test_a_folder_with_other_files_is_refused_and_unchanged(self, scene, tmp_path, files, overwrite):

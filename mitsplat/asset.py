@@ -28,8 +28,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from ruamel.yaml import YAML
 from scipy.spatial import QhullError
 
+from mitsplat.arguments import checks_arguments, path_of
 from mitsplat.arrays import Float32Array, Float64Array
-from mitsplat.errors import InputError, checks_arguments, path_of
+from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import mitsplat as ms
-from mitsplat.errors import InputError, checks_arguments
+from mitsplat.arguments import checks_arguments
+from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.labels.labels import Labels

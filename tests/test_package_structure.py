@@ -38,6 +38,7 @@ LAYERS = (
     ("capture.video", "engine", "geometry", "images"),
     ("quality", "runtime"),
     ("storage",),
+    ("arguments",),
     ("arrays", "errors", "findings", "progress", "version"),
 )
 """Packages, and modules directly in ``mitsplat``, from top to bottom. Each imports only from layers below its own.

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mitsplat.arguments import path_of
 from mitsplat.arrays import Float64Array
 from mitsplat.audit import picture_check, yolo_check
 from mitsplat.audit.bop_check import BopCheck
@@ -33,7 +34,7 @@ from mitsplat.audit.layout_check import LayoutCheck
 from mitsplat.audit.scene_check import SceneCheck
 from mitsplat.audit.yolo_check import POLYGON_AREA, POLYGON_IOU, DataYamlCheck
 from mitsplat.dataset.schema import Records, read_content
-from mitsplat.errors import InputError, path_of
+from mitsplat.errors import InputError
 from mitsplat.images.picture_files import read_picture
 from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import SPLITS, JsonObject, Record, splits_of

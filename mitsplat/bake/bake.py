@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.arguments import check_fields, check_list, check_number, check_text, check_type
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshModel, MeshPart, bake_lights, mitsuba_scene, read_model
@@ -26,7 +27,7 @@ from mitsplat.bake.radiance import BOUNCES, bake_radiance, hemisphere, ray_offse
 from mitsplat.bake.size_checks import check_size, mass_warnings
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.bake.verification import BakedView, PictureFunction, compare_views, compare_with_textures
-from mitsplat.errors import InputError, check_fields, check_list, check_number, check_text, check_type
+from mitsplat.errors import InputError
 from mitsplat.fit.refine_splats import Picture, refine_splats
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats

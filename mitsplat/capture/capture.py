@@ -23,8 +23,9 @@ import numpy.typing as npt
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field
 
+from mitsplat.arguments import checks_arguments
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
-from mitsplat.errors import InputError, checks_arguments
+from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.lens import Lens
 from mitsplat.geometry.rigid import split_similarity

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from mitsplat.errors import InputError, list_in_words
+from mitsplat.arguments import list_in_words
+from mitsplat.errors import InputError
 from mitsplat.quality import PresetName
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")]

@@ -7,11 +7,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from mitsplat.arguments import check_type, path_of
 from mitsplat.dataset.dataset_files import TIMINGS
 from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.manifest import append_line
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
-from mitsplat.errors import InputError, check_type, path_of
+from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.frames.frame import Frame
 from mitsplat.frames.sequence import with_successor

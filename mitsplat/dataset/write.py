@@ -26,6 +26,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mitsplat.arguments import check_whole_number, path_of
 from mitsplat.dataset.dataset_files import SHEET, TIMINGS, remove_folds
 from mitsplat.dataset.dataset_folder import Shard, append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.frame_job import FrameJob, RemoteFrameJob, Render, Settle, layout_errors
@@ -34,7 +35,7 @@ from mitsplat.dataset.preflight import refuse, run_faults
 from mitsplat.engine.pool import check_workers, run_frames
 from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
 from mitsplat.engine.resources import TYPICAL_MEMORY
-from mitsplat.errors import InputError, check_whole_number, path_of
+from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.budget import worker_memory
 from mitsplat.frames.frame import render_frame

@@ -17,7 +17,8 @@ from pathlib import Path
 from pickle import UnpicklingError
 from typing import TYPE_CHECKING
 
-from mitsplat.errors import InputError, MissingResourceError, list_in_words
+from mitsplat.arguments import list_in_words
+from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.storage.cache import remove_in_process
 
 if TYPE_CHECKING:

@@ -14,12 +14,13 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from functools import partial
 
+from mitsplat.arguments import check_whole_number
 from mitsplat.engine.answers import Result
 from mitsplat.engine.mps import MAX_CLIENTS, SharedGpu
 from mitsplat.engine.resources import TYPICAL_MEMORY, WorkerMemory, unused_memory
 from mitsplat.engine.scheduler import memory_error, run_pool
 from mitsplat.engine.worker_processes import MakeFrame, WorkerProcesses
-from mitsplat.errors import InputError, check_whole_number, is_out_of_memory, sentence_of
+from mitsplat.errors import InputError, is_out_of_memory, sentence_of
 from mitsplat.progress import Note, discard_note
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.runtime.device import Device, current_device, use_device

@@ -17,9 +17,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.arguments import check_fields, check_type, path_of
 from mitsplat.arrays import AnyArray
 from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo, Window
-from mitsplat.errors import InputError, check_fields, check_type, path_of
+from mitsplat.errors import InputError
 from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps, crop_map
 from mitsplat.fit.fit_folder import FitFolder, FitResult
 from mitsplat.fit.image_metrics import psnr_of

@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from mitsplat.arguments import check_type
 from mitsplat.arrays import Float32Array
-from mitsplat.errors import InputError, check_type
+from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import Development, apply_light, start_development
 from mitsplat.frames.light_properties import background_light, irradiance_of, light_properties, white_irradiance
 from mitsplat.frames.scene_builder import SceneBuilder

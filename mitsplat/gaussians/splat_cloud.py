@@ -23,8 +23,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from mitsplat.arguments import checks_arguments, describe, path_of
 from mitsplat.arrays import AnyArray, BoolArray, Float32Array
-from mitsplat.errors import InputError, checks_arguments, describe, path_of
+from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import read_materials
 from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_rotation
 from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from mitsplat.arguments import check_number, checks_arguments, describe
 from mitsplat.arrays import AnyArray, Float64Array, Int64Array
-from mitsplat.errors import InputError, check_number, checks_arguments, describe
+from mitsplat.errors import InputError
 from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.geometry.lens import (
     Lens,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from mitsplat.arguments import describe
 from mitsplat.arrays import Float64Array
-from mitsplat.errors import InputError, describe
+from mitsplat.errors import InputError
 
 RIGID = 1e-5
 """Maximum absolute entry of R R^T - 1. Rotations in single precision pass; scales do not."""

@@ -16,9 +16,10 @@ import numpy as np
 import shapely
 import trimesh
 
+from mitsplat.arguments import check_fields, check_number, check_text, check_type, path_of
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.errors import InputError, check_fields, check_number, check_text, check_type, path_of
+from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import Axis, default_up_axis
 from mitsplat.geometry.camera import Camera

@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import numpy.typing as npt
 
+from mitsplat.arguments import checks_arguments
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.errors import checks_arguments
 from mitsplat.geometry.rigid import transform_points
 from mitsplat.images.masks import (
     BOUNDARY_TOLERANCE,

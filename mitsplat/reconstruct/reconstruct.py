@@ -9,10 +9,11 @@ from typing import Literal
 import numpy as np
 import trimesh
 
+from mitsplat.arguments import check_fields, check_text
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture
-from mitsplat.errors import InputError, check_fields, check_text
+from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.decomposition import convex_pieces

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from mitsplat.arguments import check_type
 from mitsplat.arrays import AnyArray, BoolArray, Float32Array, Float64Array
-from mitsplat.errors import check_type
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.geometry.camera import Camera

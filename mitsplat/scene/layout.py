@@ -9,8 +9,9 @@ from numbers import Integral
 import numpy as np
 import numpy.typing as npt
 
+from mitsplat.arguments import checks_arguments, describe
 from mitsplat.arrays import Float64Array
-from mitsplat.errors import InputError, checks_arguments, describe
+from mitsplat.errors import InputError
 from mitsplat.scene.given_poses import asset_index, rigid_pose
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import JsonObject

@@ -11,8 +11,9 @@ from typing import Any
 
 import trimesh
 
+from mitsplat.arguments import check_type, checks_arguments
 from mitsplat.asset import Asset
-from mitsplat.errors import InputError, check_type, checks_arguments
+from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.scene.spec.object_spec import ObjectSpec
 from mitsplat.scene.spec.scene_spec import SceneSpec

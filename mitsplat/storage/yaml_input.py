@@ -19,7 +19,8 @@ from ruamel.yaml.constructor import DuplicateKeyError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.scanner import RoundTripScanner
 
-from mitsplat.errors import InputError, describe
+from mitsplat.arguments import describe
+from mitsplat.errors import InputError
 from mitsplat.storage.format_version import FORMAT_VERSION, check_format_version
 
 Validated = TypeVar("Validated", bound=BaseModel)

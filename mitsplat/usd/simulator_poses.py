@@ -22,8 +22,9 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mitsplat.arguments import check_type
 from mitsplat.arrays import Float64Array
-from mitsplat.errors import InputError, check_type
+from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.scene.given_poses import asset_index
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout

@@ -195,7 +195,7 @@ def test_code_that_decides_layouts_is_hashed():
         "scene.layout.NO_PHYSICS",
         "runtime.warp_start.quiet_warp",
         "progress.discard_note",
-        "errors.describe",  # writes the text of errors
+        "arguments.describe",  # writes the text of errors
     }
     given |= {"storage.content_hash.ContentHash"}  # names the cached files
     given |= {"storage.files.SPLITS"}  # names of counts; scene.contents assigns layouts to splits

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from mitsplat.arguments import check_fields, check_type, path_of
 from mitsplat.arrays import BoolArray
 from mitsplat.capture.alignment.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
 from mitsplat.capture.boards.board_mask import bare_squares
@@ -28,7 +29,7 @@ from mitsplat.capture.pipeline.overview import capture_sheet
 from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
 from mitsplat.capture.video import choose_frames
-from mitsplat.errors import InputError, check_fields, check_type, path_of
+from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import file_hash

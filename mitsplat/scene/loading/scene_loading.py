@@ -10,8 +10,9 @@ from typing import cast
 import numpy as np
 import trimesh
 
+from mitsplat.arguments import check_type, path_of
 from mitsplat.asset import Asset
-from mitsplat.errors import InputError, check_type, path_of
+from mitsplat.errors import InputError
 from mitsplat.scene.loading.references import LoadedFiles, errors_at_key, expand_patterns, load_files, shape_mesh
 from mitsplat.scene.planning.conveyor import check_belt
 from mitsplat.scene.planning.frame_lights import expand_rooms

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import SupportsIndex
 
-from mitsplat.errors import InputError, describe
+from mitsplat.arguments import describe
+from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt, belt_of

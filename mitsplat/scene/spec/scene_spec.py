@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from pydantic import Field, model_validator
 
-from mitsplat.errors import list_in_words
+from mitsplat.arguments import list_in_words
 from mitsplat.geometry.camera import MAX_IMAGE_SIDE
 from mitsplat.quality import PresetName
 from mitsplat.scene.spec.camera_spec import CameraSpec

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = (
     ("cli",),
     ("reconstruct.pipeline", "report"),
-    ("audit", "checks", "surroundings", "view"),
+    ("checks", "surroundings", "view"),
     ("dataset", "importing"),
     ("bake", "formats", "frames.accuracy", "gltf_splats", "reconstruct", "usd"),
     ("fit", "frames", "reconstruct.materials"),
@@ -29,8 +29,8 @@ LAYERS = (
     ("capture.pipeline", "labels", "renderer.differentiation", "renderer.light", "scene.loading"),
     ("capture.alignment",),
     ("capture", "renderer.emitters", "renderer.occluders", "renderer.splatting", "scene.planning"),
-    ("renderer.materials", "scene"),
-    ("asset", "renderer.projection"),
+    ("audit", "renderer.materials", "scene"),
+    ("asset", "dataset.records", "renderer.projection"),
     (
         *("capture.boards", "capture.isolation", "capture.lighting", "gaussians", "mesh_files", "pages"),
         *("renderer.rays", "scene.spec"),

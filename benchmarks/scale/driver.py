@@ -26,7 +26,7 @@ from pycocotools import mask as coco_mask
 from benchmarks.record import figure, recording
 from benchmarks.scale.faults import SCENE
 from mitsplat.dataset import write as dataset
-from mitsplat.dataset.manifest import encode_line
+from mitsplat.dataset.records.manifest import encode_line
 from mitsplat.scene.loading.scene_loading import load_scene
 
 LINKS = 60_000

@@ -33,7 +33,7 @@ from mitsplat.audit.layers_check import LayersCheck, PlacementCheck
 from mitsplat.audit.layout_check import LayoutCheck
 from mitsplat.audit.scene_check import SceneCheck
 from mitsplat.audit.yolo_check import POLYGON_AREA, POLYGON_IOU, DataYamlCheck
-from mitsplat.dataset.schema import Records, read_content
+from mitsplat.dataset.records.record_schema import Records, read_content
 from mitsplat.errors import InputError
 from mitsplat.images.picture_files import read_picture
 from mitsplat.storage.content_hash import file_hash

@@ -65,7 +65,7 @@ class DecodedFrame:
 
     Args:
         root: Dataset folder.
-        record: Record of the frame, which :mod:`mitsplat.dataset.schema` has checked.
+        record: Record of the frame, which :mod:`mitsplat.dataset.records.record_schema` has checked.
         content: Content of ``dataset.json``.
 
     Attributes:

@@ -39,8 +39,8 @@ from mitsplat.dataset.dataset_files import (
     remove_partial,
 )
 from mitsplat.dataset.inputs import describe_inputs
-from mitsplat.dataset.manifest import Manifest, append_line, remove_incomplete_line
-from mitsplat.dataset.schema import check_record
+from mitsplat.dataset.records.manifest import Manifest, append_line, remove_incomplete_line
+from mitsplat.dataset.records.record_schema import check_record
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.formats.registry import Catalogue, CollectionWriter
 from mitsplat.storage.files import (

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from mitsplat.dataset.dataset_files import remove_folds
 from mitsplat.dataset.dataset_folder import open_finished
-from mitsplat.dataset.schema import read_content
+from mitsplat.dataset.records.record_schema import read_content
 from mitsplat.errors import InputError
 from mitsplat.formats.coco import append_instances, create_instances_file, image_file
 from mitsplat.formats.yolo import TASKS, names_yaml

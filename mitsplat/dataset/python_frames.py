@@ -10,7 +10,7 @@ from pathlib import Path
 from mitsplat.arguments import check_type, path_of
 from mitsplat.dataset.dataset_files import TIMINGS
 from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
-from mitsplat.dataset.manifest import append_line
+from mitsplat.dataset.records.manifest import append_line
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue, write_frame

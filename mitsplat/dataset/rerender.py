@@ -19,9 +19,9 @@ from mitsplat.arguments import path_of
 from mitsplat.dataset.dataset_files import CONTENT, MANIFEST, is_written, refuse_links
 from mitsplat.dataset.dataset_folder import DEFAULT_CONTENT, content_of, first_difference
 from mitsplat.dataset.frame_job import FrameJob, Render, Settle
-from mitsplat.dataset.manifest import parse_line, read_lines
 from mitsplat.dataset.preflight import count_faults, image_faults, layout_faults, refuse
-from mitsplat.dataset.schema import check_record, read_content
+from mitsplat.dataset.records.manifest import parse_line, read_lines
+from mitsplat.dataset.records.record_schema import check_record, read_content
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import render_frame

@@ -19,8 +19,8 @@ from mitsplat.dataset.dataset_folder import (
     open_folder,
     read_shard,
 )
-from mitsplat.dataset.manifest import Manifest, read_lines
-from mitsplat.dataset.schema import read_content
+from mitsplat.dataset.records.manifest import Manifest, read_lines
+from mitsplat.dataset.records.record_schema import read_content
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue

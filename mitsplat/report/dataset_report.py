@@ -17,8 +17,8 @@ import numpy as np
 
 from mitsplat.arguments import path_of
 from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, Audit, audit_dataset
-from mitsplat.dataset.manifest import read_lines
-from mitsplat.dataset.schema import Records, read_content
+from mitsplat.dataset.records.manifest import read_lines
+from mitsplat.dataset.records.record_schema import Records, read_content
 from mitsplat.formats.coco import image_file
 from mitsplat.images.masks import Silhouette
 from mitsplat.images.picture_files import read_picture_inside

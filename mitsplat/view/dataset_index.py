@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from mitsplat.arrays import ByteImage
-from mitsplat.dataset.schema import Records, read_content
+from mitsplat.dataset.records.record_schema import Records, read_content
 from mitsplat.errors import InputError
 from mitsplat.images.picture_files import read_picture
 from mitsplat.labels.labels import Labels

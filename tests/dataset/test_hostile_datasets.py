@@ -15,7 +15,7 @@ import pytest
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.dataset_files import is_written
 from mitsplat.dataset.folds import write_folds
-from mitsplat.dataset.manifest import Manifest, encode_line
+from mitsplat.dataset.records.manifest import Manifest, encode_line
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.training import write_data

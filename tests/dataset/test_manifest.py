@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mitsplat.dataset.manifest import Manifest, encode_line, parse_line
+from mitsplat.dataset.records.manifest import Manifest, encode_line, parse_line
 from mitsplat.errors import InputError
 
 RECORDS = [{"index": index, "files": {"images/a.png": "0" * 8}, "text": 'ä\n"check":1'} for index in range(3)]

@@ -20,8 +20,8 @@ from ruamel.yaml import YAML
 from mitsplat.dataset import dataset_folder as folder
 from mitsplat.dataset import manifest
 from mitsplat.dataset.frame_job import FrameJob
-from mitsplat.dataset.manifest import Manifest
-from mitsplat.dataset.schema import read_content
+from mitsplat.dataset.records.manifest import Manifest
+from mitsplat.dataset.records.record_schema import read_content
 from mitsplat.dataset.write import write_dataset
 from mitsplat.engine import pool
 from mitsplat.engine.answers import FrameError

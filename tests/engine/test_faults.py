@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from mitsplat.dataset.manifest import Manifest
+from mitsplat.dataset.records.manifest import Manifest
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from tests.conftest import box_asset, small_scene
 from tests.dataset.test_write import contents, render, settle, write

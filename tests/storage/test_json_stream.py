@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mitsplat.dataset.manifest import Manifest, encode_line
+from mitsplat.dataset.records.manifest import Manifest, encode_line
 from mitsplat.formats import bop
 from mitsplat.formats.registry import Catalogue, CollectionWriter
 from mitsplat.storage import json_stream

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mitsplat.cli import main
-from mitsplat.dataset.manifest import Manifest
+from mitsplat.dataset.records.manifest import Manifest
 from mitsplat.errors import InputError
 from mitsplat.view.dataset_index import DatasetIndex, Filter
 from mitsplat.view.page import Address, Page, splat_arrays

@@ -18,7 +18,7 @@ from pycocotools import mask as coco_mask
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mitsplat.arrays import evenly_spaced
-from mitsplat.dataset.manifest import LONGEST_LINE, parse_line, read_lines
+from mitsplat.dataset.records.manifest import LONGEST_LINE, parse_line, read_lines
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.lens import Lens

@@ -36,8 +36,8 @@ def image():
 
 
 def splats():
-    from mitsplat.gaussians import splat_files
-    print(splat_files._convert(b"nothing", "ksplat", "ply"))
+    from mitsplat.gaussians import splat_converter
+    print(splat_converter.convert_apart(b"nothing", "ksplat", "ply"))
 
 
 def doctor():

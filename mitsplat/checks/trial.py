@@ -15,8 +15,8 @@ import numpy as np
 import trimesh
 
 from mitsplat.arrays import Float64Array
+from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import SplatArrays
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
 from mitsplat.runtime.device import use_device

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.engine.resources import WorkerMemory
+from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import SplatArrays
 from mitsplat.geometry.camera import Camera
 from mitsplat.quality import KERNELS, Quality, resolve_quality
 from mitsplat.renderer.instances.silhouettes import canvas_margin

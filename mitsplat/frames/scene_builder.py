@@ -20,8 +20,8 @@ from mitsplat.arrays import ByteImage, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.frames.background import background_picture
 from mitsplat.frames.camera_response import BACKGROUND
+from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import SplatArrays
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import device_array, make_splats_shape
 from mitsplat.renderer.scene_emitters import MitsubaDict, emitter_dict, movable

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsplat.errors import InputError
-from mitsplat.gaussians.splat_files import MAX_PLY_HEADER, columns_of, parse_ply_header, vertex_rows
+from mitsplat.gaussians.ply_files import MAX_PLY_HEADER, columns_of, parse_ply_header, vertex_rows
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.storage.files import read_regular, storage_errors, write_file
 

@@ -28,7 +28,8 @@ from mitsplat.arrays import AnyArray, BoolArray, Float32Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import read_materials
 from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_rotation
-from mitsplat.gaussians.splat_files import SplatArrays, read_splats, write_splats
+from mitsplat.gaussians.splat_arrays import SplatArrays
+from mitsplat.gaussians.splat_files import read_splats, write_splats
 from mitsplat.gaussians.splat_materials import MAX_SPECULAR, SplatMaterials
 from mitsplat.geometry.rigid import split_similarity
 from mitsplat.images.colour import decode_srgb, encode_srgb

@@ -18,7 +18,7 @@ from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import encode_sh
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import decode_spz
+from mitsplat.gaussians.spz_files import decode_spz
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.geometry.untrusted_meshes import check_mesh, try_read
 from mitsplat.mesh_files.gltf import instance_poses, world_poses

@@ -11,8 +11,9 @@ import numpy as np
 from mitsplat.arrays import Float32Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import SplatArrays, encode_spz
+from mitsplat.gaussians.spz_files import encode_spz
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.gltf_splats.splat_reading import COMPRESSION, ENCODED, EXTENSION, GLTF_FROM_SPZ
 from mitsplat.storage.files import JsonObject, storage_errors, write_file

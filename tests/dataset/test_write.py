@@ -18,8 +18,8 @@ from pycocotools.coco import COCO
 from ruamel.yaml import YAML
 
 from mitsplat.dataset import dataset_folder as folder
-from mitsplat.dataset import manifest
 from mitsplat.dataset.frame_job import FrameJob
+from mitsplat.dataset.records import manifest
 from mitsplat.dataset.records.manifest import Manifest
 from mitsplat.dataset.records.record_schema import read_content
 from mitsplat.dataset.write import write_dataset

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from mitsplat.asset import Asset
+from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import SplatArrays
 from mitsplat.storage.cache import cache_folder
 
 

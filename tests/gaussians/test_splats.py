@@ -17,9 +17,11 @@ from scipy.special import sph_harm_y
 
 from mitsplat.errors import InputError
 from mitsplat.gaussians import splat_files
+from mitsplat.gaussians.ply_files import decode_ply
 from mitsplat.gaussians.spherical_harmonics import SH_C0, evaluate_sh, sh_basis, sh_rotation
+from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.splat_files import SplatArrays
+from mitsplat.gaussians.splat_converter import convert_apart
 
 DATA = Path(__file__).parents[3] / "shared/data/splats"
 TURN = Rotation.from_rotvec([0.3, -1.1, 0.7])
@@ -311,7 +313,7 @@ class TestFiles:
         kept, data[16:] = data[turns], np.random.default_rng(degree).bytes(len(data) - 16)
         data[turns] = kept
         (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
-        converted = splat_files._decode_ply(splat_files._convert((tmp_path / "a.spz").read_bytes(), "spz", "ply"))
+        converted = decode_ply(convert_apart((tmp_path / "a.spz").read_bytes(), "spz", "ply"))
         for name, array in splat_files.read_splats(tmp_path / "a.spz")[0]._asdict().items():
             np.testing.assert_array_equal(array, getattr(converted, name), err_msg=name, strict=True)
 
@@ -443,7 +445,7 @@ class TestBadFiles:
         # Number of Gaussians in the first section, which gaussforge does not check.
         data[4096:4100] = struct.pack("<I", 4_000_000_000)
         with pytest.raises(InputError, match=r"not a valid ksplat file \(its decoder stopped with status -\d+\)"):
-            splat_files._convert(bytes(data), "ksplat", "ply")
+            convert_apart(bytes(data), "ksplat", "ply")
         (tmp_path / "a.ksplat").write_bytes(data)
         with pytest.raises(InputError, match=r"not a valid ksplat file \(a section extends beyond the file\)"):
             Splats.load(tmp_path / "a.ksplat")

@@ -1,7 +1,7 @@
 """One arm of the detector experiment with one seed: rendering, training, and evaluation on photographs.
 
     python -m benchmarks.detector.experiment WORK ARM SEED [--plan workshop.yaml] [--device cuda:0] [--weights FILE.pt]
-        [--fold 0]
+        [--fold 0] [--trained]
     python -m benchmarks.detector WORK --weights FILE.pt         # all arms and seeds, in parallel
 
 WORK is the output of ``benchmarks.detector.material``, with arms in ``arms.yaml``; with ``--plan workshop.yaml``, it is
@@ -35,7 +35,7 @@ from mitsplat.detector import DetectionMatches, TrainSettings, evaluate_detector
 from mitsplat.detector.detector_evaluation import NMS_IOU
 from mitsplat.detector.losses import error_gains
 from mitsplat.detector.scores import Detection, overlaps
-from mitsplat.detector.training import Run
+from mitsplat.detector.training import Run, open_run
 from mitsplat.storage.files import write_text
 
 HERE = Path(__file__).parent
@@ -252,14 +252,20 @@ def main() -> None:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--fold", type=int, help="train only this fold, for parallel trainings")
+    parser.add_argument("--trained", action="store_true", help="evaluate finished trainings, without rendered images")
     options = parser.parse_args()
     if options.fold is not None:
         trained = train_fold(options, read_arms(options.plan), options.fold)
         print(f"{options.arm} {options.seed}: fold {options.fold} in {trained.record['finished']['seconds']:.0f} s")
         return
-    ignore = ("work", "device", "workers", "weights", "fold")
-    with recording("detector.experiment", parser, options, ignore=ignore, gpu=True):
+    ignore = ("work", "device", "workers", "weights", "fold", "trained")
+    with recording("detector.experiment", parser, options, ignore=ignore, gpu=options.device != "cpu"):
         measure(options)
+
+
+def run_of(options: argparse.Namespace, fold: int) -> Path:
+    """Return the folder of a training."""
+    return Path(options.work) / "runs" / f"{options.arm}-{options.seed}-{fold}"
 
 
 def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int) -> Run:
@@ -276,7 +282,7 @@ def train_fold(options: argparse.Namespace, plan: Mapping[str, Any], number: int
         check_photographs(work, plan)
         folds = folds_of(plan, options.arm)
         real = photographs(work, set().union(*folds) - folds[number], f"without_fold_{number}", photos_of(plan))
-    run = work / "runs" / f"{options.arm}-{options.seed}-{number}"
+    run = run_of(options, number)
     # Without rendered images, photographs are the training set, and not an addition.
     return train_detector(rendered or [real], run, settings, real=real if rendered else None)
 
@@ -290,7 +296,7 @@ def measure(options: argparse.Namespace) -> None:
     size = plan["arms"][options.arm].get("test_size", plan["test_size"])
     detections, truth = [], {}
     for number, fold in enumerate(folds):
-        trained = train_fold(options, plan, number)
+        trained = open_run(run_of(options, number)) if options.trained else train_fold(options, plan, number)
         figure(trained.record["finished"]["seconds"], "s", "training", number)
         found = evaluate_detector(trained.path, everything, split="all", size=size, device=options.device)
         truth = json.loads((found.path / "truth.json").read_text())

@@ -23,6 +23,7 @@ from benchmarks import record
 from benchmarks.detector import __main__ as side_by_side
 from benchmarks.detector import experiment, workshop
 from benchmarks.detector.packages import make_bag, make_package, relabel
+from mitsplat.errors import InputError
 from mitsplat.scene.spec.scene_spec import SceneSpec
 
 PLANS = [experiment.PLAN, Path("workshop.yaml")]
@@ -129,7 +130,7 @@ def test_photographs_are_judged_by_detectors_that_were_not_trained_on_them(work,
     monkeypatch.setattr(experiment, "evaluate_detector", evaluate)
     monkeypatch.setattr(record, "_open", [{}])
     options = argparse.Namespace(
-        work=work, arm=arm, seed=0, plan=experiment.PLAN, weights=None, device="cpu", workers=0
+        work=work, arm=arm, seed=0, plan=experiment.PLAN, weights=None, device="cpu", workers=0, trained=False
     )
     experiment.measure(options)
     figures = {name: value for name, (value, _) in record._open[0].items()}
@@ -143,6 +144,28 @@ def test_photographs_are_judged_by_detectors_that_were_not_trained_on_them(work,
         assert figures["masks.map50_95"] == pytest.approx(0.3 * 0.9, abs=0.01)
     else:
         assert "masks.map50_95" not in figures
+
+
+def test_finished_trainings_are_evaluated_without_rendered_images(work, monkeypatch):
+    run = work / "runs" / "synthetic-3-0"
+    run.mkdir(parents=True)
+    told = {"finished": {"seconds": 2.5}, "settings": {"weights": None}, "masks": False, "classes": []}
+    (run / "run.json").write_text(json.dumps(told))
+    (run / "weights.pt").touch()
+
+    def evaluate(run: Path, data: Path, **_: Any) -> Any:
+        (run / "truth.json").write_text((data / "labels.json").read_text())
+        (run / "detections.json").write_text("[]")
+        return SimpleNamespace(path=run)
+
+    monkeypatch.setattr(experiment, "evaluate_detector", evaluate)
+    monkeypatch.setattr(record, "_open", [{}])
+    options = argparse.Namespace(work=work, arm="synthetic", seed=3, plan=experiment.PLAN, device="cpu", trained=True)
+    experiment.measure(options)
+    assert record._open[0]["training.0"] == [2.5, "s"]
+    options.seed = 4
+    with pytest.raises(InputError, match=r"synthetic-4-0: must be the folder of `mitsplat train`"):
+        experiment.measure(options)
 
 
 def test_detections_of_merged_classes_are_one_class():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,9 @@ from mitsplat.gaussians.splat_checks import check_colour_space, check_encoding, 
 from mitsplat.gaussians.splat_converter import convert_apart
 from mitsplat.gaussians.splat_training import merge_filter, ply_comment, ply_kernel
 from mitsplat.quality import KernelName
+
+PlyElements = Mapping[str, tuple[int, np.dtype[np.void]]]
+"""Elements of a PLY file by name: number of rows and type of a row."""
 
 _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
@@ -80,7 +83,7 @@ def decode_ply(data: bytes) -> SplatArrays:
     )
 
 
-def _with_colour_ranges(data: bytes, form: str, elements: dict[str, tuple[int, np.dtype[Any]]], start: int) -> bytes:
+def _with_colour_ranges(data: bytes, form: str, elements: PlyElements, start: int) -> bytes:
     """Return a compressed PLY file with ranges of colours in its chunks. Early files have none, which means 0 to 1."""
     count, row = elements.get("chunk", (0, np.dtype([])))
     end = start + count * row.itemsize
@@ -139,7 +142,7 @@ def examine_columns(data: bytes) -> tuple[list[str], KernelName | None]:
     return warnings, stated or ("mip" if _FILTER in names else "exact" if _SCALES[2] not in names else None)
 
 
-def parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[Any]]], int]:
+def parse_ply_header(data: bytes) -> tuple[str, PlyElements, int]:
     """Parse the header of a PLY file (Turk 1994).
 
     Returns:
@@ -174,9 +177,7 @@ def parse_ply_header(data: bytes) -> tuple[str, dict[str, tuple[int, np.dtype[An
     return form, {name: (counts[name], np.dtype(types[name])) for name in counts}, end.end()
 
 
-def vertex_rows(
-    data: bytes, form: str, elements: dict[str, tuple[int, np.dtype[Any]]], start: int
-) -> npt.NDArray[np.void]:
+def vertex_rows(data: bytes, form: str, elements: PlyElements, start: int) -> npt.NDArray[np.void]:
     """Return the vertices as a structured array.
 
     The stated count is checked against the file size before any allocation.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -61,7 +60,7 @@ def check_encoding(means: Float32Array, scales: Float32Array, opacities: Float32
         )
 
 
-def check_colour_space(data: bytes, elements: Mapping[str, tuple[int, np.dtype[Any]]], start: int) -> None:
+def check_colour_space(data: bytes, elements: Mapping[str, tuple[int, np.dtype[np.void]]], start: int) -> None:
     """Refuse a PLY file whose element ``color_space`` states linear colours.
 
     Args:

@@ -1,4 +1,4 @@
-"""Unoccluded silhouettes of instances on a canvas larger than the image.
+"""Complete (amodal) silhouettes of instances, without occluders, on a canvas larger than the image.
 
 A pixel belongs to the silhouette of an instance if the instance alone transmits less than half of the light behind it.
 This is the rule of the instance image (:class:`mitsplat.renderer.splatting.march.Image`), where remaining transmittance

@@ -7,6 +7,7 @@ under the lights of a scene has path-traced radiance instead (:mod:`mitsplat.bak
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -82,8 +83,8 @@ class BakeResult:
     """
 
     asset: Asset
-    psnr: float
-    psnr_object: float
+    psnr: float = math.nan
+    psnr_object: float = math.nan
     views: tuple[BakedView, ...] = ()
     surface: trimesh.Trimesh | None = None
     brightness: float | None = None
@@ -170,8 +171,6 @@ def bake_asset(
     settings = BakeSettings() if settings is None else settings
     check_type(settings, BakeSettings, "settings", "for example mitsplat.BakeSettings(gaussians=10000)")
     check_text(name, "name")
-    check_number(density, "density")
-    check_number(friction, "friction")
     if metres_per_unit is not None:
         check_number(metres_per_unit, "metres_per_unit")
     check_list(cameras, Camera, "cameras")
@@ -179,9 +178,9 @@ def bake_asset(
     check_list(pieces, trimesh.Trimesh, "pieces")
     if lights is not None:
         check_list(lights, DrawnLight, "lights")
-    _check_arguments(kind, up, density, friction)
+    _check_values(kind, up, density, friction)
     stages = _Stages(progress)
-    emitters = {} if lights is None else bake_lights(lights)
+    emitters = None if lights is None else bake_lights(lights)
     model = read_model(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
     parts = model.parts
     surface = MeshSurface(parts)
@@ -194,7 +193,7 @@ def bake_asset(
         raise InputError(
             f"{name}: no point of the mesh is visible from outside; check whether its faces are inside out"
         )
-    if lights is None:
+    if emitters is None:
         colours, materials = surface.sample_surfels(surfels, rng)
         splats = surfels.splats((colours[:, None] - 0.5) / SH_C0)
         picture, samples = surface.picture, _BASE_COLOUR_SAMPLES
@@ -225,28 +224,27 @@ def bake_asset(
     )
     warnings = _mesh_warnings(model, surface if kind == "object" else None, settings.seed)
     warnings += mass_warnings(asset, model.units)
-    units = _describe_units(model)
-    if not settings.verify_views:
-        stages.end()
-        return BakeResult(
-            asset, float("nan"), float("nan"), surface=surface.mesh, warnings=tuple(warnings), units=units
-        )
-    cameras = cameras or _orbit(surface.mesh, settings.verify_views)
-    views, psnr, psnr_object = compare_views(picture, splats, cameras, samples[1], settings.seed, stages.step)
-    brightness: float | None = None
-    if lights is None:
+    result = BakeResult(asset, surface=surface.mesh, units=_describe_units(model))
+    if settings.verify_views:
+        cameras = cameras or _orbit(surface.mesh, settings.verify_views)
+        views, psnr, psnr_object = compare_views(picture, splats, cameras, samples[1], settings.seed, stages.step)
+        result = replace(result, views=views, psnr=psnr, psnr_object=psnr_object)
+    if settings.verify_views and lights is None:
         brightness, different = compare_with_textures(parts, splats, surface.parts_of(surfels.faces))
+        result = replace(result, brightness=brightness)
         warnings += [
             f"the splats of part {part!r} are {ratio:.2g} times as bright as its texture in the file: check the factor "
             "of its material"
             for part, ratio in different.items()
         ]
     stages.end()
-    return BakeResult(asset, psnr, psnr_object, views, surface.mesh, brightness, tuple(warnings), units)
+    return replace(result, warnings=tuple(warnings))
 
 
-def _check_arguments(kind: str, up: str | None, density: float, friction: float) -> None:
-    """Raise InputError if an argument of a bake breaks a rule."""
+def _check_values(kind: str, up: str | None, density: float, friction: float) -> None:
+    """Raise InputError if a value of a bake breaks a rule."""
+    check_number(density, "density")
+    check_number(friction, "friction")
     if kind not in ("object", "environment"):
         raise InputError(f"kind must be object or environment (got {kind!r})")
     if up not in (None, "y", "z"):

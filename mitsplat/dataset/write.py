@@ -24,6 +24,8 @@ from collections import Counter
 from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 
 from mitsplat.arguments import check_whole_number, path_of
@@ -157,10 +159,8 @@ def write_dataset(
     with open_folder(
         out, content, scene.path, part, resume=True, overwrite=overwrite, any_device=any_device
     ) as manifest:
-        layouts: dict[int, list[int]] = {}
-        for index in indices:
-            if index not in manifest:
-                layouts.setdefault(layout_index_of(scene, index), []).append(index)
+        missing = (index for index in indices if index not in manifest)
+        layouts = {layout: list(found) for layout, found in groupby(missing, partial(layout_index_of, scene))}
 
         def note(text: str) -> None:
             if progress is not None:

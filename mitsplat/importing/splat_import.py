@@ -7,7 +7,7 @@ up axis is estimated; the user must give the unit or the size.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -241,22 +241,11 @@ def import_splats(
 
     report("reading the file")
     loaded, settings, reason = _read_splats(path, settings, stage)
-    cleaner = _Cleaner(path, loaded)
-    if settings.crop is not None:
-        cleaner.crop(settings.crop)
-    report("removing floaters")
-    cleaner.remove_floaters(kind)
-    report("finding up")
-    upright = find_up(cleaner.splats, kind, default_up_axis(path), settings.up)
+    cleaner, upright = _clean(path, loaded, kind, settings, report)
     if reason:
         upright = replace(upright, reason=reason)
     turn = np.eye(4)
     turn[:3, :3] = upright.rotation
-    if settings.without_table:
-        if upright.support is None:
-            raise InputError(f"{path}: has no flat surface below the object: leave out --without-table")
-        cleaner.remove("table", ~cut_support(cleaner.splats, upright.support), "nothing stands on the flat surface")
-        cleaner.remove_floaters(kind)
     support = None
     if kind == "environment" and upright.support is not None:
         support, placed = _align_to_support(cleaner.splats.transformed(turn), upright.support)
@@ -294,18 +283,37 @@ def import_splats(
         watertight=asset.mesh is not None and is_closed(asset.mesh),
         topples=kind == "object" and asset.mesh is not None and _topples(asset.mesh),
     )
-    if asset.mesh is None:
-        return result
-    report("comparing mesh and splats")
-    cameras = _cameras(asset.splats, kind, settings, _TEST_VIEWS, lowest=-0.3 if seen_below else 0.0, turn=0.7)
-    views = show_asset(asset.splats, asset.mesh, cameras)
-    offset = measure_offset(asset.mesh, surface_points(asset.splats, cameras)).shift
-    result = replace(result, views=views, offset=offset)
-    if kind == "environment":
-        return result
-    report("splitting the mesh into convex pieces")
-    asset = replace(asset, pieces=_pieces_of_parts(asset.mesh))
-    return replace(result, asset=asset, mesh_iou=float(np.mean([iou(v.alpha >= 0.5, v.mesh) for v in views])))
+    if asset.mesh is not None:
+        report("comparing mesh and splats")
+        cameras = _cameras(asset.splats, kind, settings, _TEST_VIEWS, lowest=-0.3 if seen_below else 0.0, turn=0.7)
+        views = show_asset(asset.splats, asset.mesh, cameras)
+        offset = measure_offset(asset.mesh, surface_points(asset.splats, cameras)).shift
+        result = replace(result, views=views, offset=offset)
+    if asset.mesh is not None and kind == "object":
+        report("splitting the mesh into convex pieces")
+        asset = replace(asset, pieces=_pieces_of_parts(asset.mesh))
+        overlaps = [iou(view.alpha >= 0.5, view.mesh) for view in result.views]
+        result = replace(result, asset=asset, mesh_iou=float(np.mean(overlaps)))
+    return result
+
+
+def _clean(
+    path: Path, loaded: Splats, kind: str, settings: ImportSettings, report: Callable[[str], None]
+) -> tuple[_Cleaner, Upright]:
+    """Remove floaters, and what lies outside of the box or belongs to the table; return the rest and its up axis."""
+    cleaner = _Cleaner(path, loaded)
+    if settings.crop is not None:
+        cleaner.crop(settings.crop)
+    report("removing floaters")
+    cleaner.remove_floaters(kind)
+    report("finding up")
+    upright = find_up(cleaner.splats, kind, default_up_axis(path), settings.up)
+    if settings.without_table:
+        if upright.support is None:
+            raise InputError(f"{path}: has no flat surface below the object: leave out --without-table")
+        cleaner.remove("table", ~cut_support(cleaner.splats, upright.support), "nothing stands on the flat surface")
+        cleaner.remove_floaters(kind)
+    return cleaner, upright
 
 
 def _check_physics(density: float | None, mass: float | None, friction: float) -> None:

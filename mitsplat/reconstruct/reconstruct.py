@@ -176,15 +176,7 @@ def reconstruct_asset(
     isolation = causes = None
     views: list[MaskedView] = []
     if job.kind == "object":
-        pictures = {photo.name: photo.fitted(settings.view_size) for photo in capture.photos}
-        views = [
-            MaskedView(picture.camera, picture.mask, picture.hidden)
-            for picture in (pictures[photo.name] for photo in capture.training)
-            if picture.mask is not None
-        ]
-        if len(views) < 3:
-            raise InputError(f"an object needs photos with masks from at least 3 sides (got {len(views)})")
-        causes = find_causes(capture, [picture[:3] for picture in pictures.values()])
+        views, causes = _masked_views(capture, settings.view_size)
         isolation = isolate_object(splats, views, progress=progress)
         splats = isolation.splats
     cameras = [photo.camera.fitted(settings.view_size) for photo in capture.training]
@@ -227,6 +219,19 @@ def reconstruct_asset(
         asset = replace(asset, pieces=convex_pieces(mesh if asset.mesh is None else asset.mesh))
     verdict = replace(verdict, units=asset.units)
     return Reconstruction(asset, verdict, held_out, isolation, alignment, refinement, asset_from_capture, pose=pose)
+
+
+def _masked_views(capture: Capture, size: int) -> tuple[list[MaskedView], dict[str, str]]:
+    """Return the training photos with masks, at most ``size`` px long, and the measured causes of low figures."""
+    pictures = {photo.name: photo.fitted(size) for photo in capture.photos}
+    views = [
+        MaskedView(picture.camera, picture.mask, picture.hidden)
+        for picture in (pictures[photo.name] for photo in capture.training)
+        if picture.mask is not None
+    ]
+    if len(views) < 3:
+        raise InputError(f"an object needs photos with masks from at least 3 sides (got {len(views)})")
+    return views, find_causes(capture, [picture[:3] for picture in pictures.values()])
 
 
 _MAX_SHARE_BELOW = 0.02

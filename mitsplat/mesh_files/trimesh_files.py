@@ -165,11 +165,20 @@ def _plain_content(path: Path) -> bytes | None:
 
 
 def _plain_stl(path: Path) -> bytes | None:
-    """Return a binary STL file without bytes after its last face, or None if there are none."""
+    """Return a binary STL file without bytes after its last face, or None if there are none.
+
+    Raises:
+        InputError: If these bytes are further faces.
+    """
     content = path.read_bytes()
     number = int.from_bytes(content[_STL_HEADER_BYTES : _STL_HEADER_BYTES + 4], "little")
     end = _STL_HEADER_BYTES + 4 + number * _STL_FACE_BYTES
-    return content[:end] if number and end < len(content) and b"facet" not in content[:1024] else None
+    if not number or end >= len(content) or b"facet" in content[:1024]:
+        return None
+    further, rest = divmod(len(content) - end, _STL_FACE_BYTES)
+    if not rest and content[end:].strip(b"\0"):
+        raise InputError(f"its header states {number} faces, but it has {number + further}: export it again")
+    return content[:end]
 
 
 def _check_text_stl(content: bytes, count: int) -> None:
@@ -194,8 +203,12 @@ def _check_elements(header: str) -> None:
     """Refuse a PLY file of splats, of strips of triangles or of points, for its header.
 
     Raises:
-        InputError: If it is one.
+        InputError: If it is one, or if its faces name no vertices.
     """
+    names = re.findall(r"^property list \S+ \S+ (\S+)\s*$", header, re.M)
+    if re.search(r"^element face [1-9]", header, re.M) and not {"vertex_index", "vertex_indices"} & set(names):
+        found = f"got {', '.join(names)}" if names else "got no list"
+        raise InputError(f"its faces must have a list vertex_indices ({found}): rename it, or export it again")
     if re.search(r"^element face [1-9]", header, re.M) or not re.search(r"^element", header, re.M):
         return
     if re.search(r"^element chunk |^property float (f_dc_0|rot_0)\s*$", header, re.M):

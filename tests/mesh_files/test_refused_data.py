@@ -153,3 +153,26 @@ def test_items_of_3mf_that_are_not_printed_are_left_out(tmp_path: Path) -> None:
     items = '<item objectid="1"/><item objectid="1" printable="0" transform="1 0 0 0 1 0 0 0 1 50 0 0"/>'
     model = read_model(write(tmp_path / "a.3mf", tetrahedron(1), items))
     assert len(model.parts) == 1 and model.warnings == ("its items that are not printed are left out",)
+
+
+def test_faces_of_stl_beyond_the_stated_number_are_refused(tmp_path: Path) -> None:
+    """Bytes that are no faces, such as padding and notes of a program, are left out."""
+    content = stl()
+    (tmp_path / "a.stl").write_bytes(content[:80] + (3).to_bytes(4, "little") + content[84:])
+    with pytest.raises(InputError, match="its header states 3 faces, but it has 4: export it again"):
+        read_model(tmp_path / "a.stl")
+    for more in (bytes(100), b"made by a scanner"):
+        (tmp_path / "a.stl").write_bytes(content + more)
+        assert is_complete(read_model(tmp_path / "a.stl"))
+
+
+def test_faces_of_ply_without_a_list_of_vertices_are_refused_by_name(tmp_path: Path) -> None:
+    rows = "".join(f"3 {' '.join(map(str, face))}\n" for face in FACES)
+    points = "".join(f"{x} {y} {z}\n" for x, y, z in POINTS)
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 4\n{axes}element face 4\nproperty list uchar int vertexindices\n"
+        f"end_header\n{points}{rows}"
+    )
+    with pytest.raises(InputError, match=r"must have a list vertex_indices \(got vertexindices\): rename it"):
+        read_model(tmp_path / "a.ply")

@@ -278,7 +278,7 @@ def _read_transforms(
     cameras: dict[str, Camera] = {}
     sized = set()
     for number, frame in enumerate(content.frames):
-        lens = _Lens.model_validate(content.model_dump(exclude_unset=True) | frame.model_dump(exclude_unset=True))
+        lens = _lens_of(content, frame)
         width, height = lens.w, lens.h
         if width is None or height is None:
             if frame.file_path not in sizes:
@@ -302,6 +302,14 @@ def _read_transforms(
     empty = np.zeros((0, 3))
     nothing = {name: np.zeros(0, dtype=np.int32) for name in cameras}
     return SparseModel(cameras, empty, empty.astype(np.uint8), nothing), sized
+
+
+def _lens_of(content: _Transforms, frame: _Frame) -> _Lens:
+    """Return the lens of a frame: its own keys, and else those of all frames. A field of view is a focal length."""
+    common, own = content.model_dump(exclude_unset=True), frame.model_dump(exclude_unset=True)
+    if "camera_angle_x" in own and "fl_x" not in own:
+        common = {key: value for key, value in common.items() if key not in ("fl_x", "fl_y", "camera_angle_y")}
+    return _Lens.model_validate(common | own)
 
 
 def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Camera:

@@ -272,7 +272,9 @@ def largest_first(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Re
 
 
 def known_model(cameras: dict[str, JsonObject], database: Path) -> pycolmap.Reconstruction:
-    """Return a model with known cameras and without points.
+    """Return a model with known cameras and without points, and store the cameras in the database.
+
+    COLMAP refuses a lens of another model than that in the database.
 
     Args:
         cameras: Per photo ``width``, ``height``, COLMAP's ``model`` and ``params``, and ``camera_from_world``, shape
@@ -281,18 +283,22 @@ def known_model(cameras: dict[str, JsonObject], database: Path) -> pycolmap.Reco
     """
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
-        images = opened.read_all_images()
+        images = [image for image in opened.read_all_images() if image.name in cameras]
+        lenses = {
+            image.image_id: pycolmap.Camera(
+                model=known["model"],
+                width=known["width"],
+                height=known["height"],
+                params=known["params"],
+                camera_id=image.camera_id,
+            )
+            for image in images
+            for known in [cameras[image.name]]
+        }
+        for lens in lenses.values():
+            opened.update_camera(lens)
     for image in images:
-        if image.name not in cameras:
-            continue
-        known = cameras[image.name]
-        camera = pycolmap.Camera(
-            model=known["model"],
-            width=known["width"],
-            height=known["height"],
-            params=known["params"],
-            camera_id=image.camera_id,
-        )
+        known, camera = cameras[image.name], lenses[image.image_id]
         model.add_camera_with_trivial_rig(camera)
         placed = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
         pose = np.array(known["camera_from_world"])

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
@@ -105,6 +106,34 @@ def test_transforms_json_is_read_and_points_are_triangulated(
     (tmp_path / "transforms.json").write_text('{"frames": []}')
     with pytest.raises(InputError, match=r"transforms\.json: frames: "):
         read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work", base=folder)
+
+
+def test_points_are_triangulated_by_fisheye_cameras(photos: tuple[Path, dict[str, Camera]], tmp_path: Path) -> None:
+    """The photos are resampled to a fisheye lens. A second run has other intrinsics in the same folder."""
+    folder, frames, k = tmp_path / "given", [], np.array([1.0, 0.2, 0.05, 0.0])
+    folder.mkdir()
+    for name in (f"photo{number:02}.png" for number in range(4)):
+        camera = photos[1][name]
+        matrix = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+        grid = np.stack(np.meshgrid(*map(np.arange, (camera.width, camera.height))), axis=-1).astype(np.float64)
+        source = cv2.fisheye.undistortPoints(grid.reshape(1, -1, 2), matrix, k, None, matrix)
+        places = source.reshape(camera.height, camera.width, 2).astype(np.float32)
+        with Image.open(photos[0] / name) as image:
+            turned = cv2.remap(np.asarray(image.convert("RGB")), places, None, cv2.INTER_LINEAR)
+        Image.fromarray(turned).save(folder / name)
+        frames.append({"file_path": name, "transform_matrix": (camera.world_from_camera * (1, -1, -1, 1)).tolist()})
+    intrinsics = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    prepared, _ = prepare_photos(folder, tmp_path / "copies", max_size=480)
+    shares: list[int] = []
+    for coefficients in (dict(zip(("k1", "k2", "k3", "k4"), k.tolist(), strict=True)), {}):
+        model_key = {"camera_model": "OPENCV_FISHEYE"} if coefficients else {}
+        (tmp_path / "transforms.json").write_text(
+            json.dumps(intrinsics | coefficients | model_key | {"frames": frames})
+        )
+        model, _ = read_poses(tmp_path / "transforms.json", prepared, tmp_path / "work", base=folder)
+        shares.append(int((np.abs(model.points[:, 2]) < 2e-3).sum()))
+    assert shares[0] > 100
+    assert shares[1] < 0.9 * shares[0]  # 116 and 146 points are on the board, z = 0
 
 
 def test_given_masks_replace_computed_masks(
@@ -207,6 +236,9 @@ def test_lenses_of_instant_ngp_are_read(tmp_path: Path) -> None:
     assert (fisheye.lens, fisheye.distortion) == ("fisheye", (0.02, 0.003, 0.0, 0.0))
     pinhole = read({"camera_angle_x": 2 * np.arctan(320 / 600), "camera_angle_y": 2 * np.arctan(240 / 500)})
     assert (pinhole.fx, pinhole.fy) == pytest.approx((600, 500))
+    frame["camera_angle_x"] = 2 * np.arctan(320 / 700)
+    assert read({"fl_x": 600, "fl_y": 610}).fx == pytest.approx(700)  # the frame's own lens
+    assert read({"fl_x": 600, "fl_y": 610}).fy == pytest.approx(700)
 
 
 @pytest.mark.parametrize(

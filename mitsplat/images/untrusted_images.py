@@ -13,6 +13,11 @@ from mitsplat.runtime.child_process import limit_memory, run_bounded
 IMAGE_SUFFIXES = (".exr", ".hdr", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga")
 """Suffixes of image files that patterns match."""
 
+_REMEDIES = {
+    "Unsupported number of components": "its colours are CMYK: export it as RGB",
+    "Unknown file format": f"it must be one of {', '.join(IMAGE_SUFFIXES)}: export it as .png",
+}
+"""Messages in place of those of Mitsuba that contain the key."""
 _SECONDS = 120
 _MEMORY = 6 << 30
 _Stamp = tuple[Path, int, int]
@@ -69,6 +74,10 @@ def _read_images(output: BinaryIO, _: bytes, *arguments: str) -> None:
     for path, limit in zip(arguments[::2], arguments[1::2], strict=True):
         limit_memory(int(limit))
         check_exr_header(Path(path))
-        mi.Bitmap(path)
+        try:
+            mi.Bitmap(path)
+        except RuntimeError as error:
+            remedy = next((text for part, text in _REMEDIES.items() if part in str(error)), None)
+            raise error if remedy is None else ValueError(remedy) from None
         output.write(b"\n")
         output.flush()

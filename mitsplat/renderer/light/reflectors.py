@@ -8,7 +8,7 @@ and the light of one further ray, which ends at the next surface.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +18,8 @@ from mitsplat.renderer.light.light_tiles import STRIDE
 from mitsplat.renderer.materials.principled import SpecularLobe, power_weight
 from mitsplat.renderer.materials.proxy_materials import SurfaceMaterial
 from mitsplat.renderer.materials.radiance_grid import RadianceGrid
-from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies, TraceScene
+from mitsplat.renderer.occluders.proxies import Boxes, OccluderScene, Proxies, TraceScene
+from mitsplat.renderer.rays.device_arrays import gathered
 
 LANES = 1 << 20
 """Number of rays that are traced at once."""
@@ -74,6 +75,32 @@ class _Point:
     def metal(self) -> mi.Bool:
         """True for metals, which mirror the further ray."""
         return self.surface.metallic > 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Paths:
+    """Rays that end at objects or visible meshes.
+
+    Attributes:
+        ray: The rays.
+        hit: Their ends.
+        key: Integer per ray, which selects its points of a low-discrepancy sequence.
+        emitter_sample: Point of the unit square per ray that selects an emitter.
+        spread: GGX's alpha of the lobe that reflects the light of each ray.
+        weight: Share (Color3f) of the light that is seen; 1 for rays that are not reflected again.
+    """
+
+    ray: mi.Ray3f
+    hit: mi.PreliminaryIntersection3f
+    key: mi.UInt32
+    emitter_sample: mi.Point2f
+    spread: mi.Float
+    weight: mi.Color3f
+
+    def set(self, lane: mi.UInt32, others: _Paths) -> None:
+        """Replace the paths ``lane`` in place."""
+        for field in fields(self):
+            dr.scatter(getattr(self, field.name), getattr(others, field.name), lane)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,59 +212,51 @@ class Reflectors:
             hits_object &= near.t < self.emitters.sky_reach
         distance = dr.select(near.is_valid(), dr.select(hits_object, near.t, dr.inf), distance)
         has_colour = dr.max(colour) > 0
-        dr.eval(near, colour, captured, hits_object, distance, has_colour)
+        boxes = self.proxies.boxes if bounces > 1 and dynamic.materials is not None else None
+        weight = mi.Color3f(1) if boxes is None else dr.full(mi.Color3f, 1, dr.width(key))
+        dr.eval(near, colour, captured, hits_object, distance, has_colour, weight)
+        paths = _Paths(ray, near, key, emitter_sample, spread, weight)
         lane = dr.compress(has_colour)
         if static is not None and dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (colour, ray, triangle, key, emitter_sample))
-            dr.scatter(colour, self._relit_capture(static, bounces, *some), lane)
+            seen, number, light_sample = (dr.gather(type(v), v, lane) for v in (captured, key, emitter_sample))
+            place = _place_on(static, dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, triangle, lane))
+            free = self._unshadowed(static, place, number, light_sample)
+            dr.scatter(colour, dr.select(free, seen, 0), lane)
+            onward = None
+            if boxes is not None:
+                onward = self._paths_from_captures(static, dynamic, boxes, place, seen, number)
+            if onward is not None:
+                lane = dr.gather(mi.UInt32, lane, onward[0])
+                paths.set(lane, onward[1])
+                dr.scatter(hits_object, mi.Bool(True), lane)
         lane = dr.compress(hits_object)
         if dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (ray, near, key, emitter_sample, spread))
-            dr.scatter(colour, self._reflected(bounces, *some), lane)
+            light = dr.gather(mi.Color3f, colour, lane) + self._reflected(bounces, gathered(paths, lane))
+            dr.scatter(colour, light, lane)  # scatter_add compiles per size
         dr.eval(colour)
         return colour, captured, distance
 
-    def _relit_capture(
-        self,
-        static: TraceScene,
-        bounces: int,
-        captured: mi.Color3f,
-        ray: mi.Ray3f,
-        triangle: mi.UInt32,
-        key: mi.UInt32,
-        emitter_sample: mi.Point2f,
-    ) -> mi.Color3f:
-        """Return the colour (Color3f) of captured surfaces with the shadows and the reflected light of objects."""
-        normal = _towards(static.normal_at(triangle, mi.Bool(True)), ray)
-        origin = _lifted(ray(ray.maxt), normal)
-        colour = dr.select(self._unshadowed(static, receiver(origin, normal), key, emitter_sample), captured, 0)
-        dynamic, boxes = self.proxies.dynamic, self.proxies.boxes
-        if bounces == 1 or boxes is None or dynamic is None or dynamic.materials is None:
-            return colour
-        near_objects = boxes.form_factor(origin, normal) > MIN_COVER
-        dr.eval(colour, origin, normal, near_objects)
-        lane = dr.compress(near_objects)
-        if dr.width(lane):
-            some = (dr.gather(type(v), v, lane) for v in (captured, origin, normal, key))
-            added = self._reflected_onto_capture(static, dynamic, *some)
-            dr.scatter(colour, dr.gather(mi.Color3f, colour, lane) + added, lane)  # scatter_add compiles per size
-        return colour
-
-    def _reflected_onto_capture(
+    def _paths_from_captures(
         self,
         static: TraceScene,
         dynamic: TraceScene,
+        boxes: Boxes,
+        place: mi.SurfaceInteraction3f,
         captured: mi.Color3f,
-        origin: mi.Point3f,
-        normal: mi.Normal3f,
         key: mi.UInt32,
-    ) -> mi.Color3f:
-        """Return the colour (Color3f) that the light of objects adds to captured surfaces, from one ray each.
+    ) -> tuple[mi.UInt32, _Paths] | None:
+        """Return paths from captured surfaces to objects that light them, and their lanes; None if there are none.
 
         The captured colour is albedo * E / white with the irradiance E of the emitters, so that
 
             added colour = min(captured * white / E, 1) * mean colour of objects over the cosine-weighted hemisphere
         """
+        near_objects = boxes.form_factor(place.p, place.n) > MIN_COVER
+        dr.eval(place.p, place.n, near_objects)
+        lane = dr.compress(near_objects)
+        if not dr.width(lane):
+            return None
+        captured, origin, normal, key = (dr.gather(type(v), v, lane) for v in (captured, place.p, place.n, key))
         numbers = [_sequence_number(key, dimension) for dimension in range(4)]
         upward = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*numbers[:2]))
         ray, emitter_sample = mi.Ray3f(origin, mi.Frame3f(normal).to_world(upward)), mi.Point2f(*numbers[2:])
@@ -246,21 +265,19 @@ class Reflectors:
         near = dynamic.intersect(ray)
         hits_object = near.is_valid()
         dr.eval(ray, near, hits_object, emitter_sample)
-        added = dr.zeros(mi.Color3f, dr.width(key))
-        lane = dr.compress(hits_object)
-        if not dr.width(lane):
-            return added
-        some = (dr.gather(type(v), v, lane) for v in (ray, near, key, emitter_sample, captured, normal))
-        ray, near, key, emitter_sample, captured, normal = some
+        row = dr.compress(hits_object)
+        if not dr.width(row):
+            return None
+        some = (dr.gather(type(v), v, row) for v in (ray, near, key, emitter_sample, captured, normal, lane))
+        ray, near, key, emitter_sample, captured, normal, lane = some
         ray.maxt = near.t
         free = ~static.intersect(ray).is_valid()
-        dr.eval(ray, near, key, emitter_sample, captured, normal, free)
-        spread = dr.opaque(mi.Float, CAPTURED_SPREAD, dr.width(key))
-        light = self._reflected(2, ray, near, key * 0x9E3779B1 + 0x85EBCA77, emitter_sample, spread)
         irradiance = self.emitters.unoccluded_irradiance(receiver(ray.o, normal), free)
         albedo = dr.minimum(captured * self.white / dr.maximum(irradiance, 1e-20), 1)
-        dr.scatter(added, dr.select(free, albedo * light, 0), lane)
-        return added
+        spread = dr.opaque(mi.Float, CAPTURED_SPREAD, dr.width(key))
+        paths = _Paths(ray, near, key * 0x9E3779B1 + 0x85EBCA77, emitter_sample, spread, dr.select(free, albedo, 0))
+        dr.eval(lane, paths)
+        return lane, paths
 
     def _unshadowed(
         self, static: TraceScene, place: mi.SurfaceInteraction3f, key: mi.UInt32, emitter_sample: mi.Point2f
@@ -309,26 +326,18 @@ class Reflectors:
         dr.eval(shaded)
         return ~shaded
 
-    def _reflected(
-        self,
-        bounces: int,
-        ray: mi.Ray3f,
-        hit: mi.PreliminaryIntersection3f,
-        key: mi.UInt32,
-        emitter_sample: mi.Point2f,
-        spread: mi.Float,
-    ) -> mi.Color3f:
+    def _reflected(self, bounces: int, paths: _Paths) -> mi.Color3f:
         """Return the colour (Color3f) of objects and visible meshes: reflected light of one emitter and one ray."""
         dynamic = self.proxies.dynamic
         if dynamic is None:
             return mi.Color3f(0)
         materials, last = dynamic.materials, bounces == 1
         glossy = materials is not None and materials.glossy and not last
-        point = self._point_at(dynamic, ray, hit, spread if glossy else None)
-        lit = self._direct_light(point, key, emitter_sample)
-        if last or materials is None:
-            return lit
-        return self._with_onward_light(lit, point, key, bounces - 1)
+        point = self._point_at(dynamic, paths.ray, paths.hit, paths.spread if glossy else None)
+        lit = self._direct_light(point, paths.key, paths.emitter_sample)
+        if not last and materials is not None:
+            lit = self._with_onward_light(lit, point, paths.key, bounces - 1)
+        return lit * paths.weight
 
     def _point_at(
         self, dynamic: TraceScene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, spread: mi.Float | None
@@ -440,6 +449,12 @@ def widened(roughness: mi.Float, spread: mi.Float) -> mi.Float:
     (Kaplanyan and Dachsbacher 2013, "Path Space Regularization for Holistic and Robust Light Transport").
     """
     return dr.sqrt(dr.sqrt(dr.power(roughness, 4) + dr.square(spread)))
+
+
+def _place_on(scene: TraceScene, ray: mi.Ray3f, triangle: mi.UInt32) -> mi.SurfaceInteraction3f:
+    """Return the places where rays end at triangles, lifted off the surface."""
+    normal = _towards(scene.normal_at(triangle, mi.Bool(True)), ray)
+    return receiver(_lifted(ray(ray.maxt), normal), normal)
 
 
 def _towards(normal: mi.Normal3f, ray: mi.Ray3f) -> mi.Normal3f:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -19,26 +18,7 @@ from mitsplat.audit.audit import CrossFrameCheck, audit_dataset
 from mitsplat.errors import InputError
 from mitsplat.storage.files import Record
 from tests.cli.typed import run
-
-
-def records_of(root: Path) -> list[Record]:
-    return [json.loads(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
-
-
-def store(root: Path, records: list[Record]) -> None:
-    """Write the manifest with the current hashes of the files and valid line checksums."""
-    for record in records:
-        for file in record["files"]:
-            record["files"][file] = hashlib.sha256((root / file).read_bytes()).hexdigest()
-    store_lines(root, records)
-
-
-def store_lines(root: Path, records: list[Record]) -> None:
-    lines = []
-    for record in records:
-        text = json.dumps({key: value for key, value in record.items() if key != "check"}, separators=(",", ":"))
-        lines.append(f'{text[:-1]},"check":"{hashlib.sha256(text.encode()).hexdigest()[:16]}"}}\n')
-    (root / "manifest.jsonl").write_text("".join(lines))
+from tests.manifests import records_of, store, store_lines
 
 
 def first(records: list[Record]) -> Any:

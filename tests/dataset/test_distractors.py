@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from mitsplat.scene.spec.scene_spec import FORMATS
 from mitsplat.scene.streams import random_stream
 from tests.conftest import box_asset, small_scene
 from tests.drawn import large_boxes, render_boxes
+from tests.manifests import records_of
 from tests.synthetic import CERTIFICATE
 
 OBJECTS = [
@@ -63,10 +63,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 @pytest.fixture(scope="module")
 def made(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(scene, tmp_path_factory.mktemp("made") / "out")
-
-
-def records_of(root: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (root / "manifest.jsonl").read_bytes().splitlines()]
 
 
 def test_a_dataset_with_distractors_has_no_violations(made: Path) -> None:

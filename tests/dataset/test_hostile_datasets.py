@@ -26,6 +26,7 @@ from mitsplat.storage.files import MAX_JSON_DEPTH, open_in_place, parse_json, re
 from mitsplat.view.dataset_index import DatasetIndex
 from tests.conftest import BOTH, nut_and_bolt, small_scene
 from tests.dataset.test_write import contents, write
+from tests.manifests import records_of
 
 FORMATS = ["yolo", "yolo-detect", "coco", "depth", "exr"]
 PRECIOUS = "years of work\n"
@@ -286,7 +287,7 @@ class TestTypes:
     @pytest.mark.parametrize("key", ["index", "files", "split", "labels", "camera", "layout"])
     @pytest.mark.parametrize("new", [KeyError, -1], ids=repr)
     def test_a_line_with_any_key_missing_or_of_another_type_is_refused(self, scene, out, key, new):
-        lines = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+        lines = records_of(out)
         for line in lines:
             del line["check"]
         lines[1] = _changed(lines[1], (key,), new)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from mitsplat.scene.layout import Layout, LeftOut, UnsettledLayoutError
 from mitsplat.scene.scene import Scene
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
+from tests.manifests import records_of
 
 WORDS = "fell over in 5 of 5 draws"
 
@@ -68,7 +68,7 @@ def files_of(root: Path) -> dict[Path, bytes]:
 
 
 def test_the_manifest_names_omitted_objects_and_frames_keep_their_numbers(whole: DatasetSummary) -> None:
-    records = [json.loads(line) for line in (whole.path / "manifest.jsonl").read_bytes().splitlines()]
+    records = records_of(whole.path)
     assert [record["index"] for record in records] == list(range(16))
     lacking = {record["index"]: record["left_out"] for record in records if "left_out" in record}
     assert list(lacking) == [4, 5, 10, 11]

@@ -23,6 +23,7 @@ from mitsplat.scene.spec.shape_spec import Conveyor
 from mitsplat.scene.splits import split_of
 from tests.conftest import BOTH, small_scene
 from tests.drawn import large_boxes
+from tests.manifests import records_of
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,7 @@ def test_given_frames_have_no_violations_in_every_format(scene: Scene, frames: l
     assert summary.instances == {"bolt": 3, "nut": 3}
     assert summary.images == {"train": 2, "val": 1}
     assert list(audit_dataset(tmp_path / "out").violations) == []
-    records = [json.loads(line) for line in (tmp_path / "out/manifest.jsonl").read_text().splitlines()]
+    records = records_of(tmp_path / "out")
     assert [record["layout"] for record in records] == [0, 1, 2]
     poses = [label["world_from_object"] for label in records[2]["labels"]["instances"] if label["class"] == "nut"]
     assert poses[0][0][3] == pytest.approx(0.07)
@@ -70,7 +71,7 @@ def test_the_manifest_records_the_exposure_of_the_camera(scene: Scene, tmp_path:
     layout = Layout.from_poses(scene, {"nut": [np.eye(4)], "bolt": [np.diag([1, -1, -1, 1])]})
     frame = next(render_frames(scene, layouts=layout, quality="fast", progress=False))
     out = write_frames(scene, tmp_path / "out", [frame]).path
-    (record,) = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+    (record,) = records_of(out)
     assert record["viewpoint"] == {"motion": json.loads(json.dumps(frame.plan.viewpoint["motion"]))}
     assert list(audit_dataset(out).violations) == []
 
@@ -105,7 +106,7 @@ def test_the_flow_of_a_film_is_written_and_audited(scene: Scene, frames: list, t
     files = [f"flow/{split_of(n, output.validation, output.test)}/{n:06d}.flo" for n in range(4)]
     assert [(out / file).is_file() for file in files] == [True, True, False, False]
     assert list(audit_dataset(out).violations) == []
-    records = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+    records = records_of(out)
     assert [record.get("next") for record in records] == [1, 2, None, None]
     # A flow in which the nut stands still contradicts the poses of the manifest.
     flow = cv2.readOpticalFlow(str(out / files[0]))

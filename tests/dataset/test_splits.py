@@ -19,11 +19,11 @@ from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.spec.scene_spec import FORMATS, HoldOut
-from tests.audit.test_audit import records_of, store
 from tests.cli.typed import run
 from tests.conftest import box_asset, small_scene
 from tests.dataset.test_distractors import scatter_drawn
 from tests.drawn import large_boxes, render_boxes
+from tests.manifests import records_of, store
 
 FORMATS_HERE = [name for name in FORMATS if name != "colmap"]
 

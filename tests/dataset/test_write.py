@@ -35,6 +35,7 @@ from mitsplat.runtime import device as devices
 from mitsplat.runtime.device import Device, Gpu
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.storage.files import SPLITS
+from tests.manifests import records_of
 from tests.synthetic import render, settle
 
 PARSE_LINE = manifest.parse_line
@@ -85,7 +86,7 @@ class TestContent:
         assert told[0] == (0, 12, "starting")
         assert told[-1] == (12, 12, "frame 11")
         assert sum("settling layout" in text for *_, text in told) == 3
-        records = [json.loads(line) for line in (tmp_path / "out/manifest.jsonl").read_text().splitlines()]
+        records = records_of(tmp_path / "out")
         assert [record["index"] for record in records] == list(range(12))
         for record in records:
             assert len(record["files"]) == 3

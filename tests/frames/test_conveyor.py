@@ -20,8 +20,8 @@ from mitsplat.labels.flow import UNKNOWN_FLOW, exposure_flow
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.planning.conveyor import Belt
 from mitsplat.scene.spec.shape_spec import Box
-from tests.audit.test_audit import records_of, store
 from tests.conftest import WriteScene
+from tests.manifests import records_of, store
 
 SceneData = dict[str, Any]
 STEP = 0.02
@@ -127,7 +127,7 @@ def test_a_dataset_with_a_belt_has_no_violations(belt_data: SceneData, write_sce
     scene = ms.load_scene(write_scene(belt_data))
     out = write_dataset(scene, tmp_path / "out", settle=lying, workers=1).path
     assert audit_dataset(out).violations == ()
-    records = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+    records = records_of(out)
     places = np.array([[label["world_from_object"][0][3] for label in r["labels"]["instances"]] for r in records])
     np.testing.assert_allclose(places, [[-STEP, 0], [0, 0], [STEP, 0]] * 2, atol=1e-15)
     assert [record["conveyor"]["time"] for record in records] == pytest.approx([-0.1, 0, 0.1] * 2)

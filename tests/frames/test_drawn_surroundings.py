@@ -23,6 +23,7 @@ from mitsplat.scene.planning.contents import draw_arrangements, draw_regions
 from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.conftest import WriteScene, box_asset
+from tests.manifests import records_of
 
 SceneData = dict[str, Any]
 
@@ -115,7 +116,7 @@ def test_a_dataset_with_drawn_environments_has_no_violations(
     out = write_dataset(scene, tmp_path / "out", settle=lying, workers=1).path
     found = audit_dataset(out)
     assert found.violations == () and found.instances == 6
-    records = [json.loads(line) for line in (out / "manifest.jsonl").read_bytes().splitlines()]
+    records = records_of(out)
     for record in records:
         place = draw_surroundings(scene.spec, record["index"])
         assert set(record["place"]) == {"environment", "materials", "background"}
@@ -152,7 +153,7 @@ def test_the_manifest_records_regions_and_arrangements(
     scene = ms.load_scene(write_scene(scene_data))
     out = write_dataset(scene, tmp_path / "out", settle=lying, workers=1).path
     assert audit_dataset(out).violations == ()
-    records = [json.loads(line) for line in (out / "manifest.jsonl").read_bytes().splitlines()]
+    records = records_of(out)
     told = [record["objects"][0]["region"] for record in records]
     assert told == [("main", "shelf")[draw_regions(scene.spec, index)[0]] for index in range(4)]
     assert set(told) == {"main", "shelf"}

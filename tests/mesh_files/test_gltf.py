@@ -18,11 +18,7 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.images.colour import encode_srgb
 from tests.mesh_files.glb import CORNER_UV, CORNERS, QUAD, SIZE, Glb, coordinate_image, cube_mesh, matt, sheet
 
-
-@pytest.fixture(autouse=True)
-def _without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read files in this process alone; tests/test_security.py checks the trial read."""
-    monkeypatch.setattr("mitsplat.mesh_files.mesh_reading.check_mesh", lambda path, read: None)
+pytestmark = pytest.mark.usefixtures("without_trial")
 
 
 WEIGHTS = np.array([(0.5, 0.3, 0.2), (0.1, 0.6, 0.3), (0.2, 0.15, 0.65)])

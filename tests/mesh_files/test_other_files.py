@@ -17,9 +17,7 @@ COLOUR = (200, 120, 40)
 UTM = np.array([512345.0, 5401234.0, 310.0])
 
 
-@pytest.fixture(autouse=True)
-def _without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsplat.mesh_files.mesh_reading.check_mesh", lambda path, read: None)
+pytestmark = pytest.mark.usefixtures("without_trial")
 
 
 def write_obj(path: Path, mtl: str, *, centre: np.ndarray | float = 0.0) -> Path:

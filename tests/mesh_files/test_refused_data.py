@@ -16,9 +16,7 @@ from tests.mesh_files.test_threemf import tetrahedron, write
 NAMES = ("red", "green", "blue")
 
 
-@pytest.fixture(autouse=True)
-def _without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsplat.mesh_files.mesh_reading.check_mesh", lambda path, read: None)
+pytestmark = pytest.mark.usefixtures("without_trial")
 
 
 @pytest.mark.parametrize(("kind", "values"), [("ushort", "65535 32768 0"), ("char", "-1 64 0"), ("int", "0 0 256")])

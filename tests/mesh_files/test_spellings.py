@@ -22,9 +22,7 @@ VOLUME = 4.0
 COLOUR = (200, 100, 50)
 
 
-@pytest.fixture(autouse=True)
-def _without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsplat.mesh_files.mesh_reading.check_mesh", lambda path, read: None)
+pytestmark = pytest.mark.usefixtures("without_trial")
 
 
 def shown(model: MeshModel) -> list[int]:

@@ -23,9 +23,7 @@ RED, GREEN, BLUE = np.eye(3)
 IDENTITY = "1 0 0 0 1 0 0 0 1"
 
 
-@pytest.fixture(autouse=True)
-def _without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsplat.mesh_files.mesh_reading.check_mesh", lambda path, read: None)
+pytestmark = pytest.mark.usefixtures("without_trial")
 
 
 def tetrahedron(number: int, *, more: str = "", triangles: tuple[str, ...] = ("",) * 4) -> str:

@@ -14,8 +14,9 @@ import pytest
 
 from mitsplat.pages.svg_charts import HeatMap, Histogram, bars, columns
 from mitsplat.report.dataset_report import SAMPLES, write_report
-from tests.audit.test_audit import records_of, store, swap_a_class
+from tests.audit.test_audit import swap_a_class
 from tests.cli.typed import run
+from tests.manifests import records_of, store
 
 
 class Page(HTMLParser):

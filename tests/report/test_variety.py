@@ -17,8 +17,8 @@ from mitsplat.pages.svg_charts import discs
 from mitsplat.report import variety
 from mitsplat.report.dataset_report import write_report
 from mitsplat.report.variety import MIN_VIEWS, RINGS, SECTORS, Variety, cell_of
-from tests.audit.test_audit import records_of, store
 from tests.cli.typed import run
+from tests.manifests import records_of, store
 
 CONTENT = {"classes": ["bolt", "nut"], "assets": ["long bolt", "nut"]}
 

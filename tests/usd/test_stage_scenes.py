@@ -23,6 +23,7 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.usd.stage_scene import read_stage_scene
 from tests.cli.typed import run
+from tests.manifests import records_of
 from tests.usd.test_simulated_frames import INDEX, folder  # noqa: F401 - a fixture
 from tests.usd.test_usd_assets import new_stage
 
@@ -150,7 +151,7 @@ def test_time_samples_of_poses_become_a_sequence_with_stable_ids(
     assert "not imported: the change of the scale of /World/moving" in printed
     assert "(3 images of 3 time codes)" in printed
     assert run("audit", tmp_path / "out") == 0
-    records = [json.loads(line) for line in (tmp_path / "out/manifest.jsonl").read_text().splitlines()]
+    records = records_of(tmp_path / "out")
     # The ball moves by 0.1 m and the camera by 0.05 m: 80 px 0.05 / depth, in the mean around the axis of its turn,
     # which is at (34.7, 30).
     (file,) = (name for name in records[0]["files"] if name.startswith("flow/"))
@@ -193,7 +194,7 @@ def test_an_object_leaves_the_images_in_which_the_stage_hides_it(
         in capsys.readouterr().out
     )
     assert run("audit", tmp_path / "out") == 0
-    records = [json.loads(line) for line in (tmp_path / "out/manifest.jsonl").read_text().splitlines()]
+    records = records_of(tmp_path / "out")
     found = [{one["class"]: one["id"] for one in record["labels"]["instances"]} for record in records]
     assert found == [{"moving": 2}, {"still": 1}, {"still": 1, "moving": 2}]
 

@@ -29,24 +29,18 @@ from mitsplat.capture.lighting.brackets import merge_exposures, read_photograph
 from mitsplat.capture.lighting.lamps import rectangle_axes, rectangle_irradiance
 from mitsplat.capture.lighting.mirror_ball import find_ball, unwrap_ball
 from mitsplat.capture.lighting.panorama import directions, level_irradiance, level_weights, solid_angles, unit_vector
-from mitsplat.cli import main
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import LUMINANCE, decode_srgb, encode_srgb
 from mitsplat.renderer.scene_emitters import emitter_dict, y_up_to_z_up
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightSpec
 from tests.capture.lighting import room
+from tests.cli.typed import run
 from tests.conftest import WriteScene
 
 HEIGHT, WIDTH = 256, 512
 ASIDE = (0.012, -0.01, 0.006)
 """Offset from the ball of the point that an off-axis camera looks at [m]."""
-
-
-def run(*args: object) -> int:
-    with pytest.raises(SystemExit) as exited:
-        main([str(arg) for arg in args])
-    return int(exited.value.code or 0)
 
 
 def between(a: Float64Array, b: Float64Array) -> float:

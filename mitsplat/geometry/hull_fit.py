@@ -13,6 +13,8 @@ from mitsplat.geometry.mesh_distance import DistanceSurface
 
 HULL_TOLERANCE = 5e-5
 """Default of the largest deviation of the hulls [m]."""
+_SAME_DISTANCE = 1e-6
+"""Difference of distances below which pieces are equally near to a vertex [m]."""
 
 
 def fit_to_hull(
@@ -26,8 +28,9 @@ def fit_to_hull(
 
     Bodies of equal convex hulls rest equally on a plane. Vertices of pieces outside of the hull of the mesh move to its
     nearest point. Vertices of that hull outside of the joint hull of the pieces are added to the nearest piece, until
-    none is farther outside than the tolerance. A piece grows by no more than the distance of its new vertices. Pieces
-    that need no change are returned as they are.
+    none is farther outside than the tolerance. If several pieces are equally near, because they meet there, each of
+    them gets the vertex. Otherwise, one of them would have a skewed facet. A piece grows by no more than the distance
+    of its new vertices. Pieces that need no change are returned as they are.
 
     Args:
         pieces: Convex pieces of the mesh [m].
@@ -43,9 +46,10 @@ def fit_to_hull(
     if len(corners):
         distances = np.stack([DistanceSurface(piece).nearest(corners)[2] for piece in pieces])
         near = distances.min(axis=0) <= reach
-        corners, nearest = corners[near], distances.argmin(axis=0)[near]
+        corners, distances = corners[near], distances[:, near]
+        nearest = distances <= distances.min(axis=0) + _SAME_DISTANCE
         added = _add_farthest_first(joint, corners, tolerance)
-        fitted = [np.concatenate([own, corners[added[nearest[added] == i]]]) for i, own in enumerate(fitted)]
+        fitted = [np.concatenate([own, corners[added[nearest[i, added]]]]) for i, own in enumerate(fitted)]
     joint.close()
     return tuple(
         piece if np.array_equal(new, piece.vertices) else trimesh.convex.convex_hull(new)

@@ -112,7 +112,7 @@ def spur_gear() -> Pieces:
 
 
 def bearing(outer: float, inner: float, width: float) -> Pieces:
-    return ring(0.5 * outer, 0.5 * inner, 0.0, width, chamfer=0.5)
+    return ring(0.5 * outer, 0.5 * inner, 0.0, width, chamfer=0.7)
 
 
 def cable_clip() -> Pieces:

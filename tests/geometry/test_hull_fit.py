@@ -54,6 +54,14 @@ def test_pieces_grow_by_no_more_than_the_distance_of_their_new_vertices(ball):
     assert np.linalg.norm(upper.vertices, axis=1).max() == pytest.approx(0.01, abs=ROUNDING)
 
 
+def test_pieces_that_meet_at_a_vertex_of_the_hull_both_get_it(ball):
+    """Otherwise, a facet beside a seam is skewed, and a wheel of such pieces rolls on differently than its hull."""
+    fitted = fit_to_hull(halves(ball, 0.97), ball)
+    upper, lower = ({tuple(one) for one in piece.vertices if one[2] == 0} for piece in fitted)
+    assert upper == lower
+    assert len(upper) > 8
+
+
 def test_pieces_with_the_hull_of_the_mesh_stay_as_they_are(ball):
     pieces = halves(ball, 1.0)
     assert all(new is old for new, old in zip(fit_to_hull(pieces, ball), pieces, strict=True))

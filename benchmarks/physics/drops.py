@@ -2,9 +2,10 @@
 
 Warp takes several times as long as the others; ``--steppers mujoco reference`` leaves it out.
 
-A cube, coins of several ratios of height to diameter, and the shipped parts fall 0.05 to 0.25 m from random poses, with
-both steppers and with MuJoCo's own time stepping as a reference. A part rests flat or on edge if the symmetry axis of
-its inertia, or else the z axis, is within 25 degrees of the vertical or within 17 degrees of the horizontal.
+A cube, coins of several ratios of height to diameter, steel dice, and the shipped parts fall 0.05 to 0.25 m from random
+poses, with both steppers and with MuJoCo's own time stepping as a reference. A part rests flat or on edge if the
+symmetry axis of its inertia, or else the z axis, is within 25 degrees of the vertical or within 17 degrees of the
+horizontal.
 
 The reference shares no code with the steppers: the convex hull of the part on a plane, which is exact on a table, with
 steps of 0.5 ms and a damping ratio for the restitution (Nagurka and Huang, 2004, "A Mass-Spring-Damper Model of a
@@ -15,6 +16,11 @@ h / sqrt(h^2 + d^2) (Yong and Mahadevan, 2011, "Probability, geometry, and dynam
 rebounds, thin coins do so more rarely: an American nickel (h/d = 0.09) in one of about 6000 tosses (Murray and Teare,
 1993, "Probability of a tossed coin landing on edge"), and a coin of h/d = 1 in half of the tosses (Hernández-Navarro
 and Piñero, 2022, "Exact face-landing probabilities for bouncing objects").
+
+Dice have two square faces of 15 mm and a height of ``die RATIO`` times that. They rest flat on a square face, and on
+edge on one of the four others. Students rolled such dice, cut from a steel bar (Mungan and Lipscombe, 2013,
+"Probability analysis for rolls of a square cuboidal die", table 1). The surface and other conditions change the shares
+(Riemer, Stoyan and Obreschkow, 2013, "Cuboidal dice and Gibbs distributions").
 
 The formula of Yong and Mahadevan is the solid angle of the edge, as seen from the centre of mass. By the same argument,
 a hex nut that does not rebound rests on a side with the probability of the solid angle of its sides. Those of its
@@ -55,7 +61,9 @@ ASSETS = Path(__file__).resolve().parents[2] / "scenes/assets"
 STEPPERS = ("warp", "mujoco", "reference")
 RATIOS = (0.09, 0.2, 0.35, 0.5, 0.75, 1.0)
 PUBLISHED = {0.09: (1 / 6000, "Murray and Teare"), 1.0: (0.5, "Hernández-Navarro and Piñero")}  # with rebounds
-DIAMETER = 0.025
+DICE = {0.47: (0.916, 332), 0.63: (0.738, 840), 0.81: (0.496, 740), 1.16: (0.148, 1011), 1.55: (0.040, 606)}
+"""Published shares of rolls that end on a square face, and their numbers, by the height over the side of the square."""
+DIAMETER, DIE_SIDE = 0.025, 0.015
 BATCH = 20
 CHUNK = 5  # batches that a process makes with one simulation
 SPACING = 0.5
@@ -86,19 +94,20 @@ class Part:
 
 
 def part_names() -> list[str]:
-    """Return the names of the cube, the coins, and the shipped parts."""
+    """Return the names of the cube, the coins, the dice, and the shipped parts."""
     shipped = sorted(path.name for path in ASSETS.iterdir() if (path / "pieces.ply").exists())
-    return ["cube", *(f"coin {ratio:g}" for ratio in RATIOS), *shipped]
+    return ["cube", *(f"coin {ratio:g}" for ratio in RATIOS), *(f"die {ratio:g}" for ratio in DICE), *shipped]
 
 
 def make_part(name: str) -> Part:
-    if name == "cube" or name.startswith("coin"):
-        if name == "cube":
+    kind, _, ratio = name.partition(" ")
+    if kind in ("cube", "coin", "die"):
+        if kind == "cube":
             mesh = trimesh.creation.box((0.02, 0.02, 0.02))
+        elif kind == "die":
+            mesh = trimesh.creation.box((DIE_SIDE, DIE_SIDE, float(ratio) * DIE_SIDE))
         else:
-            mesh = trimesh.creation.cylinder(
-                radius=DIAMETER / 2, height=float(name.split()[1]) * DIAMETER, sections=128
-            )
+            mesh = trimesh.creation.cylinder(radius=DIAMETER / 2, height=float(ratio) * DIAMETER, sections=128)
         return Part(mesh, (mesh,), mass_properties(mesh, (mesh,), density=7850.0), np.array([0.0, 0.0, 1.0]))
     asset = Asset.load(ASSETS / name)
     if asset.mesh is None:
@@ -275,6 +284,11 @@ def show(
         print(
             f"{name:18} by solid angle on a side: {side_share:.2%} to {1 - flat_share:.2%} without rebound", flush=True
         )
+    if name.startswith("die"):
+        share, rolls = DICE[float(name.split()[1])]
+        published = binomtest(round(share * rolls), rolls).proportion_ci(method="wilson")
+        figure((published.low, published.high), "", name, "published flat")
+        print(f"{name:18} published flat: {published.low:.2%} to {published.high:.2%} of {rolls} rolls", flush=True)
     if name.startswith("coin"):
         ratio = float(name.split()[1])
         expected = ratio / np.hypot(ratio, 1)

@@ -169,7 +169,8 @@ def averaged_reflections(
         light_filter: Filter over the pixels.
         tinted: Light per ray that the base colour multiplies (Color3f).
         colourless: Other light per ray (Color3f).
-        variance: Variance of its brightness.
+        variance: Variance of the brightness of the reflection rays. That of light in the lobe that shadow rays find is
+            missing: pixels that mirror a lamp are averaged less.
         mirrored: Mean of the directions that a pixel mirrors.
     """
     dr.eval(tinted, colourless, variance)

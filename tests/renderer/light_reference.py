@@ -164,8 +164,8 @@ class BoxScene:
     def _share_left(self, point: Array, normal: Array) -> float:
         """Return the share of light that dynamic boxes leave at a point of a captured box.
 
-        Lamps behind captured boxes do not count. Of the sky, dynamic boxes also block the light that captured boxes
-        behind them reflect.
+        Lamps behind captured boxes do not count. Where captured boxes hide the sky, dynamic boxes block the light of
+        these boxes, at most that of the sky.
         """
         places, facing, area = self.lamp.samples()
         way = places - point
@@ -177,7 +177,9 @@ class BoxScene:
         static, dynamic = self._entries(point, to_lamp)
         lost = lamp[(dynamic < distance) & (static >= distance)].sum()
         static, dynamic = self._entries(point, to_sky)
-        return float(1 - (lost + sky[dynamic < static].sum()) / (lamp.sum() + sky.sum()))
+        of_boxes = min(self.grey * self.white / (np.pi * self.sky), 1.0)
+        lost += (sky * np.where(static < np.inf, of_boxes, 1.0))[dynamic < static].sum()
+        return float(1 - lost / (lamp.sum() + sky.sum()))
 
     def _reflected_onto_captured(self, point: Array, normal: Array) -> float:
         """Return the light that dynamic boxes reflect onto a captured box, times its albedo.

@@ -24,7 +24,7 @@ from mitsplat.renderer.light.reflections import COLUMN_STEP, RAY_STEP, ROW_STEP,
 from mitsplat.renderer.light.shadow_rays import ROBERTS
 from mitsplat.renderer.materials.principled import typical_brightness
 from tests.renderer.test_bounce import mitsuba_camera
-from tests.renderer.test_light import WHITE_SKY, down_camera, floor, nothing, slab
+from tests.renderer.test_light import WHITE_SKY, down_camera, floor, noise_free, nothing, slab
 
 CAMERA = Camera.look_at((0, -0.6, 0.5), (0, 0, 0), width=120, height=90, fov_x=50)
 LAMP_CENTRE, LAMP_HALF = np.array([0.05, 0.35, 0.4]), 0.08
@@ -291,6 +291,37 @@ def test_mirror_shows_captured_colours_of_its_directions() -> None:
     inside = binary_erosion(layers.instance == 1, iterations=2)
     seen = (layers.light + layers.highlight)[inside].mean(axis=0)
     np.testing.assert_allclose(seen, expected, rtol=0.02)
+
+
+@pytest.mark.parametrize("wall", [0.1, 0.9])
+def test_object_before_a_wall_blocks_the_light_of_the_wall_and_not_of_the_sky(wall: float) -> None:
+    """A captured wall of radiance L hides half of a sky of radiance 1, and a black screen the wall.
+
+    The floor, which a metal plate mirrors, loses L / (1 + L) of its light. :meth:`Reflectors._arriving_share` gives
+    L / 2, because it chooses directions by the light of the sky alone.
+    """
+    make_integrator()
+    plate = trimesh.creation.box(bounds=[[0.15, 0.1, 0.0], [0.28, 0.11, 0.1]])
+    surfels = place_surfels(plate, 1.0, 4000, np.random.default_rng(0))
+    metal = SplatMaterials.uniform(len(surfels.points), metallic=1.0, roughness=0.05)
+    splats = replace(surfels.splats(np.zeros((len(surfels.points), 1, 3))), materials=metal)
+    turn = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0))
+    shapes = {
+        "plate": make_splats_shape(splats, proxy=plate, instance=1),
+        "sky": WHITE_SKY,
+    }
+    tall = trimesh.creation.box(bounds=[[0.3, -500, -500], [0.4, 500, 500]])
+    sheet = floor(0.4, wall).transformed(turn @ trimesh.transformations.translation_matrix((0, 0, 0.3)))
+    both = trimesh.util.concatenate([slab(), tall])
+    shapes["floor"] = make_splats_shape(Splats.concatenate([floor(0.4), sheet]), proxy=both)
+    screen = trimesh.creation.box(bounds=[[0.29, -500, 0.001], [0.299, 500, 500]])
+    camera = Camera.look_at((0.2, -0.5, 0.4), (0.2, 0.1, 0.04), width=48, height=36, fov_x=12)
+    light = []
+    for more in ({}, {"screen": make_splats_shape(nothing(), proxy=screen, instance=2)}):
+        layers = noise_free({**shapes, **more}, camera, white=np.pi)
+        light.append(layers.light[binary_erosion(layers.instance == 1, iterations=2)].mean())
+    radiance = float(decode_srgb(wall))
+    assert light[1] / light[0] == pytest.approx(1 - radiance / 2, abs=0.05)
 
 
 def test_reflections_at_a_silhouette_are_averaged() -> None:

@@ -163,6 +163,12 @@ class Emitters:
             density = dr.select(open_sky, sky_density * chance, density)
         return radiance, density
 
+    def sky_radiance(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Color3f:
+        """Return the radiance (Color3f) of the sky, which must exist, in unit directions from ``si``."""
+        if self.even_sky:
+            return self.sky_colour
+        return self._sky_radiance(si, direction, dr.gather(mi.EmitterPtr, self.pointers, self.sky), active)
+
     def _lamps_along(
         self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.Bool, mi.UInt32, mi.Color3f, mi.Float]:

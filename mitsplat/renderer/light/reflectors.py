@@ -220,8 +220,8 @@ class Reflectors:
         if static is not None and dr.width(lane):
             seen, number, light_sample = (dr.gather(type(v), v, lane) for v in (captured, key, emitter_sample))
             place = _place_on(static, dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, triangle, lane))
-            free = self._unshadowed(static, place, number, light_sample)
-            dr.scatter(colour, dr.select(free, seen, 0), lane)
+            share = self._arriving_share(static, place, number, light_sample)
+            dr.scatter(colour, seen * share, lane)
             onward = None
             if boxes is not None:
                 onward = self._paths_from_captures(static, dynamic, boxes, place, seen, number)
@@ -279,13 +279,15 @@ class Reflectors:
         dr.eval(lane, paths)
         return lane, paths
 
-    def _unshadowed(
+    def _arriving_share(
         self, static: TraceScene, place: mi.SurfaceInteraction3f, key: mi.UInt32, emitter_sample: mi.Point2f
-    ) -> mi.Bool:
-        """Return False for captured surfaces that dynamic objects shade from one sampled emitter.
+    ) -> mi.Float:
+        """Return the share of light that dynamic objects leave at captured surfaces, from one sampled emitter.
 
-        The expected value is the share of the light that arrives, because one of several samples is chosen in
-        proportion to its irradiance (Talbot et al. 2005, "Importance Resampling for Global Illumination").
+        The sample is chosen from several in proportion to its irradiance (Talbot et al. 2005, "Importance Resampling
+        for Global Illumination"). Where a captured wall hides the sky, objects block the light of the wall instead, at
+        most that of the sky. Walls do not change the chances of directions: shadows are too weak where dark walls hide
+        much of the sky.
         """
 
         def choose(
@@ -320,11 +322,14 @@ class Reflectors:
         blocked = shaded & wall.is_valid()
         shadow.maxt = dr.select(blocked, wall.t, shadow.maxt)
         self._end_kernel(shadow, blocked, shaded)
-        # From the directions of the sky, objects also block the light that captured walls behind them reflect.
         behind = self._occluded(shadow, mi.UInt32(0), key, blocked & sky, self.proxies.shadow_casters)
-        shaded &= ~blocked | behind
-        dr.eval(shaded)
-        return ~shaded
+        lost = dr.select(shaded & ~blocked, mi.Float(1), 0)
+        if self.emitters.sky is not None and self.grid is not None:
+            of_wall = self.grid.at(shadow, dr.select(behind, shadow.maxt, 0), behind) * self.white
+            of_sky = dr.pi * self.emitters.sky_radiance(place, direction, behind)
+            lost = dr.select(behind, dr.minimum(dr.sum(of_wall) / dr.maximum(dr.sum(of_sky), 1e-20), 1), lost)
+        dr.eval(lost)
+        return 1 - lost
 
     def _reflected(self, bounces: int, paths: _Paths) -> mi.Color3f:
         """Return the colour (Color3f) of objects and visible meshes: reflected light of one emitter and one ray."""

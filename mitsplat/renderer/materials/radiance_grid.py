@@ -1,8 +1,8 @@
 """Captured colours of the surroundings, for rays that hit them.
 
-A grid of mean colours is sufficient where light is averaged over many directions. Colours
-depend on the direction: a mat is brighter at grazing angles, and the constant term of spherical harmonics, which is
-its colour there, is up to 1.5 times as bright as the mat from above.
+A grid of mean colours is sufficient where light is averaged over many directions. Colours depend on the direction: a
+mat is brighter at grazing angles, and the constant term of spherical harmonics, which is its colour there, is up to 1.5
+times as bright as the mat from above.
 """
 
 from __future__ import annotations

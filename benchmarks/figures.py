@@ -38,8 +38,6 @@ PAGES = {"figures.md": "docs/figures.md", "reliability.md": "docs/reliability.md
 SENTENCES = "sentences.md"
 VIEWS, BYTES = 8, 2.5e5
 """Frames per layout and bytes per frame in the projection: those of the default scene."""
-LATE = 50
-"""Number of commits behind the newest revision from which a caption states the age."""
 
 RENAMED_OPTIONS = {
     "mitsplat fit": {"--edge": "--max-size"},
@@ -122,11 +120,9 @@ def present_command(result: Mapping[str, Any]) -> str:
     return command
 
 
-def caption(result: Mapping[str, Any], newest: int = 0) -> str:
-    """Return the source of figures: command, machine, load, revision, and commits behind the newest revision."""
+def caption(result: Mapping[str, Any]) -> str:
+    """Return the source of figures: command, machine, load and revision."""
     load, day = load_of(result), revision_of(result)
-    late = newest - (result.get("commits") or newest)
-    day += f", {late} commits before the newest figure" if late >= LATE else ""
     text = f"`{present_command(result)}` on {machine_of(result)}" + (f", {load}" if load else "")
     if result["recorded"] == "transcribed":
         text += f"; taken over from the notes of revision {day}, not recorded anew since"
@@ -156,12 +152,9 @@ def load_of(result: Mapping[str, Any]) -> str:
     return f"load {load['start']} to {load['end']}" if load["start"] is not None else load.get("said") or ""
 
 
-def runs(results: Iterable[Mapping[str, Any]], newest: int) -> str:
-    """Return a table of results, with the commits between their revision and the newest one."""
-    lines = [
-        "| command | machine | load | revision | commits since | recorded |",
-        "| --- | --- | --- | --- | ---: | --- |",
-    ]
+def runs(results: Iterable[Mapping[str, Any]]) -> str:
+    """Return a table of results."""
+    lines = ["| command | machine | load | revision | recorded |", "| --- | --- | --- | --- | --- |"]
     for result in results:
         if result["recorded"] == "transcribed":
             how = "taken over from notes"
@@ -169,21 +162,19 @@ def runs(results: Iterable[Mapping[str, Any]], newest: int) -> str:
             how = f"in {result['seconds']:.0f} s" + (", with changes" if result.get("dirty") else "")
         how += f". {result['note']}" if result.get("note") else ""
         load, day = load_of(result).removeprefix("load "), f"{result['revision']}, {result['date']}"
-        late = "–" if result.get("commits") is None else newest - result["commits"]
-        lines.append(f"| `{present_command(result)}` | {machine_of(result)} | {load} | {day} | {late} | {how} |")
+        lines.append(f"| `{present_command(result)}` | {machine_of(result)} | {load} | {day} | {how} |")
     return "\n".join(lines)
 
 
 def filled(text: str, results: Results) -> str:
     """Fill a template with its figures."""
-    newest = max((result.get("commits") or 0 for result in results.values()), default=0)
 
     def fill(match: re.Match[str]) -> str:
         words = match[1].split()
         try:
             match words:
                 case ["runs"]:
-                    return runs((result for result in results.values() if "command" in result), newest)
+                    return runs(result for result in results.values() if "command" in result)
                 case ["detectors", *plan_and_arms]:
                     return experiment_table(results, *plan_and_arms)
                 case ["detector", plan, arm]:
@@ -194,8 +185,8 @@ def filled(text: str, results: Results) -> str:
                     if missing := [name for name in names if "command" not in results.get(name, {})]:
                         raise FigureError(f"no result {missing[0]}")
                     if what == "runs":
-                        return runs((results[name] for name in names), newest)
-                    return "  \n".join(f"*{caption(results[name], newest)}*" for name in names)
+                        return runs(results[name] for name in names)
+                    return "  \n".join(f"*{caption(results[name])}*" for name in names)
                 case ["revision", result]:
                     return revision_of(results[result])
                 case ["cells", result, prefix, *cells] if cells:

@@ -135,7 +135,7 @@ def recording(
         "command": shlex.join([*words, *sys.argv[1:]]),
         "recorded": "run",
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        **at,
+        "revision": at,
         "machine": machine(gpu),
         "load": {"start": round(load, 1), "end": round(os.getloadavg()[0], 1)},
         "seconds": round(time.monotonic() - start, 1),
@@ -184,14 +184,12 @@ def refusal(folder: Path = ROOT) -> str | None:
     )
 
 
-def revision(folder: Path = ROOT) -> dict[str, Any]:
-    """Return the commit and the number of commits that led to it; unknown outside of a checkout."""
+def revision(folder: Path = ROOT) -> str:
+    """Return the commit; ``unknown`` outside of a checkout."""
     try:
-        commit = _output_of("git", "-C", str(folder), "rev-parse", "--short=9", "HEAD")
-        number = int(_output_of("git", "-C", str(folder), "rev-list", "--count", "HEAD"))
+        return _output_of("git", "-C", str(folder), "rev-parse", "--short=9", "HEAD")
     except (OSError, subprocess.CalledProcessError):
-        return {"revision": "unknown", "commits": None}
-    return {"revision": commit, "commits": number}
+        return "unknown"
 
 
 def machine(gpu: bool) -> dict[str, Any]:

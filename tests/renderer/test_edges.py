@@ -200,6 +200,28 @@ def test_both_sides_of_a_border_have_their_own_light() -> None:
     assert error(smooth) < 0.1 * min(error(plain), error(centres))
 
 
+def test_both_sides_of_a_border_of_meshes_have_their_own_light() -> None:
+    """A dark plate has ten times the light of the bright plate behind it."""
+    dark = mi.ScalarTransform4f().translate([0, 0, -0.7]).rotate([0, 0, 1], 37).scale(0.3)
+    lamp = {"type": "point", "position": [0, 0, -1.3], "intensity": {"type": "rgb", "value": 3.0}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "lamp": lamp,
+            "near": plate(dark) | {"bsdf": {"type": "twosided", "b": {"type": "diffuse", "reflectance": 0.1}}},
+            "far": plate(mi.ScalarTransform4f().translate([0, 0, 0.7]).scale(3)),
+        }
+    )
+    lit = {"shadow": "traced", "white": 3.0, "bounce": False, "highlight": False}
+    smooth, plain = (layers_of(scene, CAMERA, replace(FINE, samples=samples), **lit) for samples in ("edges", 1))
+    large = CAMERA.resized(2 * CAMERA.width, 2 * CAMERA.height)
+    twin = means_of_four(layers_of(scene, large, replace(FINE, samples=1), **lit).rgb)
+    changed = changed_by(smooth, plain)
+    assert changed.mean() > 0.02
+    error = [float(np.sqrt(np.mean((layers.rgb - twin)[changed] ** 2))) for layers in (smooth, plain)]
+    assert error[0] < 0.1 * error[1]
+
+
 def test_crowded_edges_are_sampled_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     from mitsplat.renderer.instances import antialiasing as edges
     from mitsplat.renderer.splatting import pairs

@@ -17,7 +17,7 @@ from mitsplat.quality import Quality
 from mitsplat.renderer.composition.material_borders import FROM_PROXY
 from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneContents, same_shapes
 from mitsplat.renderer.instances.antialiasing import Edges
-from mitsplat.renderer.instances.primary_visibility import NO_SPLAT, PrimaryVisibility
+from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
 from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes, with_area_beyond
 from mitsplat.renderer.light.light import Accuracy, light_factor
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
@@ -191,7 +191,7 @@ class LayerRenderer:
             splat, own = edges.trace(contents.clouds, contents.placements, self.quality, key_at_pixel, z_max)
         shown = PrimaryVisibility.of(splat, meshes, emitters, z_max, dr.pi / white)
         other = edges.nearest_other(key, shown.key)
-        shares = shown.shares(splat, own, key_at_pixel >= NO_SPLAT)
+        shares = shown.shares(splat, own, key_at_pixel)
 
         def mixed(values: mi.Color3f, share: mi.Color3f | mi.Float) -> mi.Color3f:
             """Return the mean of the values at the ray's pixel, with weight ``share``, and at the other pixel."""

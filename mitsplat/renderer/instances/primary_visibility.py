@@ -28,6 +28,7 @@ class PrimaryVisibility:
         diffuse: True if that mesh is purely diffuse.
         front: True if the pixel shows a mesh or an emitter instead of splats.
         emission: Radiance of emitters behind (Color3f), in the picture's scale.
+        mesh: Key of the mesh or emitter behind the splats; 0 if there is none.
         key: Equal for rays that show the same instance or the same mesh.
     """
 
@@ -39,6 +40,7 @@ class PrimaryVisibility:
     diffuse: mi.Bool
     front: mi.Bool
     emission: mi.Color3f
+    mesh: mi.UInt32
     key: mi.UInt32
 
     @classmethod
@@ -58,21 +60,22 @@ class PrimaryVisibility:
         colour = _linear(splat.rgb, splat.alpha)
         alpha, key = splat.alpha, mi.UInt32(splat.instance)
         solid, diffuse, front, emission = mi.Bool(False), mi.Bool(False), mi.Bool(False), mi.Color3f(0)
-        shape = mi.UInt32(0)
+        mesh = mi.UInt32(0)
         if behind:
             solid = behind.valid & (behind.depth <= z_max)
             diffuse = solid & behind.diffuse
             colour += dr.select(diffuse, behind.reflectance * (1 - splat.alpha), 0)
             alpha = dr.select(solid, 1, alpha)
-            shape = dr.select(solid, dr.reinterpret_array(mi.UInt32, behind.hit.shape), 0)
+            mesh = dr.select(solid, dr.reinterpret_array(mi.UInt32, behind.hit.shape), 0)
         if emitters:
             alpha = dr.select(solid | emitters.everywhere | (emitters.depth < dr.inf), 1, alpha)
             emission = dr.select(solid, 0, emitters.radiance * scale * (1 - splat.alpha))
         if z_max is not None:
             front = (z_max < dr.inf) & (splat.centre_alpha < 0.5)
-            key = dr.select(front, shape + NO_SPLAT, key)
+            mesh = dr.select(z_max < dr.inf, mesh + NO_SPLAT, 0)
+            key = dr.select(front, mesh, key)
         cover = dr.select(diffuse, 1, splat.alpha)
-        return cls(colour, alpha, splat.alpha, cover, solid, diffuse, front, emission, key)
+        return cls(colour, alpha, splat.alpha, cover, solid, diffuse, front, emission, mesh, key)
 
     def with_luminance(self, luminance: mi.Float) -> PrimaryVisibility:
         """Return this visibility with another luminance of the splats, where ``luminance`` is positive.
@@ -83,20 +86,22 @@ class PrimaryVisibility:
         changed = (luminance > 0) & (own > 0) & ~self.solid
         return replace(self, colour=dr.select(changed, luminance * self.splat_alpha / own, 1) * self.colour)
 
-    def shares(self, splat: Image, own: list[mi.Float], on_mesh: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
+    def shares(self, splat: Image, own: list[mi.Float], surface: mi.UInt32) -> tuple[mi.Color3f, mi.Float]:
         """Return the shares of ``colour`` (Color3f) and of ``cover`` (Float) that one surface has.
 
         Args:
             splat: Splats along the rays.
             own: Opacity, red, green and blue of the splats of an instance, as parts of those of ``splat``.
-            on_mesh: True if the surface is the diffuse mesh; otherwise it is that instance.
+            surface: Key of the surface, a mesh or that instance.
         """
         opacity, *encoded = own
         others = [dr.maximum(a - b, 0) for a, b in zip(splat.rgb, encoded, strict=True)]
         here, beside = _linear(encoded, opacity), _linear(others, splat.alpha - opacity)
         mesh = self.colour - _linear(splat.rgb, splat.alpha)
-        total, here = here + beside + mesh, dr.select(on_mesh, mesh, here)
-        cover = dr.select(on_mesh, self.cover - splat.alpha, opacity)
+        total = here + beside + mesh
+        on_mesh, same = surface >= NO_SPLAT, surface == self.mesh
+        here = dr.select(on_mesh, dr.select(same, mesh, 0), here)
+        cover = dr.select(on_mesh, dr.select(same, self.cover - splat.alpha, 0), opacity)
         return mi.Color3f(*[_share(h, t) for h, t in zip(here, total, strict=True)]), _share(cover, self.cover)
 
     def lit(

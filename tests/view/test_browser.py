@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -92,9 +92,18 @@ def until(what: Callable[[], Any]) -> Any:
 
 
 def screen(browser: Any) -> np.ndarray:
-    """Return the screenshot (H, W, 3): the render on the left, splats in the middle, controls on the right."""
-    image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
-    return np.asarray(image).astype(int)
+    """Return the screenshot (H, W, 3): the render on the left, splats in the middle, controls on the right.
+
+    chromedriver ends a screenshot after 10 s, which a busy machine exceeds; it is then taken again.
+    """
+    from selenium.common.exceptions import TimeoutException
+
+    def taken() -> bytes:
+        with suppress(TimeoutException):
+            return bytes(browser.get_screenshot_as_png())
+        return b""
+
+    return np.asarray(Image.open(io.BytesIO(until(taken))).convert("RGB")).astype(int)
 
 
 def render(browser: Any) -> np.ndarray:

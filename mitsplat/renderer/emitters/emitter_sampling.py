@@ -163,11 +163,11 @@ class Emitters:
             density = dr.select(open_sky, sky_density * chance, density)
         return radiance, density
 
-    def sky_radiance(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Color3f:
-        """Return the radiance (Color3f) of the sky, which must exist, in unit directions from ``si``."""
-        if self.even_sky:
-            return self.sky_colour
-        return self._sky_radiance(si, direction, dr.gather(mi.EmitterPtr, self.pointers, self.sky), active)
+    def sky_radiance(
+        self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f, emitter: mi.EmitterPtr, active: mi.Bool
+    ) -> mi.Color3f:
+        """Return the radiance (Color3f) of the sky ``emitter`` in unit directions from ``si``."""
+        return self.sky_colour if self.even_sky else self._sky_radiance(si, direction, emitter, active)
 
     def _lamps_along(
         self, scene: mi.Scene, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool
@@ -193,12 +193,11 @@ class Emitters:
     ) -> tuple[mi.Color3f, mi.Float]:
         """Return radiance (Color3f) and sampling density of the sky in unit directions."""
         density = dr.maximum(dr.dot(si.sh_frame.n, direction), 0) * dr.inv_pi
-        if self.even_sky:
-            return self.sky_colour, density
-        towards = dr.zeros(mi.DirectionSample3f, dr.width(direction))
-        towards.d = direction
-        density = 0.5 * (density + emitter.pdf_direction(si, towards, active))
-        return self._sky_radiance(si, direction, emitter, active), density
+        if not self.even_sky:
+            towards = dr.zeros(mi.DirectionSample3f, dr.width(direction))
+            towards.d = direction
+            density = 0.5 * (density + emitter.pdf_direction(si, towards, active))
+        return self.sky_radiance(si, direction, emitter, active), density
 
     def _towards(
         self, si: mi.SurfaceInteraction3f, index: mi.UInt32, point: mi.Point2f, active: mi.Bool

@@ -222,9 +222,7 @@ class Reflectors:
             place = _place_on(static, dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, triangle, lane))
             share = self._arriving_share(static, place, number, light_sample)
             dr.scatter(colour, seen * share, lane)
-            onward = None
-            if boxes is not None:
-                onward = self._paths_from_captures(static, dynamic, boxes, place, seen, number)
+            onward = None if boxes is None else self._paths_from_captures(static, dynamic, boxes, place, seen, number)
             if onward is not None:
                 lane = dr.gather(mi.UInt32, lane, onward[0])
                 paths.set(lane, onward[1])
@@ -326,7 +324,8 @@ class Reflectors:
         lost = dr.select(shaded & ~blocked, mi.Float(1), 0)
         if self.emitters.sky is not None and self.grid is not None:
             of_wall = self.grid.at(shadow, dr.select(behind, shadow.maxt, 0), behind) * self.white
-            of_sky = dr.pi * self.emitters.sky_radiance(place, direction, behind)
+            emitter = dr.gather(mi.EmitterPtr, self.emitters.pointers, self.emitters.sky)
+            of_sky = dr.pi * self.emitters.sky_radiance(place, direction, emitter, behind)
             lost = dr.select(behind, dr.minimum(dr.sum(of_wall) / dr.maximum(dr.sum(of_sky), 1e-20), 1), lost)
         dr.eval(lost)
         return 1 - lost

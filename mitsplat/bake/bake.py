@@ -229,14 +229,14 @@ def bake_asset(
         cameras = cameras or _orbit(surface.mesh, settings.verify_views)
         views, psnr, psnr_object = compare_views(picture, splats, cameras, samples[1], settings.seed, stages.step)
         result = replace(result, views=views, psnr=psnr, psnr_object=psnr_object)
-    if settings.verify_views and lights is None:
-        brightness, different = compare_with_textures(parts, splats, surface.parts_of(surfels.faces))
-        result = replace(result, brightness=brightness)
-        warnings += [
-            f"the splats of part {part!r} are {ratio:.2g} times as bright as its texture in the file: check the factor "
-            "of its material"
-            for part, ratio in different.items()
-        ]
+        if lights is None:
+            brightness, different = compare_with_textures(parts, splats, surface.parts_of(surfels.faces))
+            result = replace(result, brightness=brightness)
+            warnings += [
+                f"the splats of part {part!r} are {ratio:.2g} times as bright as its texture in the file: check the "
+                "factor of its material"
+                for part, ratio in different.items()
+            ]
     stages.end()
     return replace(result, warnings=tuple(warnings))
 

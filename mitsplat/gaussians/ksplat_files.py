@@ -60,6 +60,7 @@ def read_ksplat(data: bytes) -> KsplatRows:
     if version != _VERSION or level not in (0, 1, 2):
         got = f"{version[0]}.{version[1]} and {level}"
         raise InputError(f"ksplat files must have version 0.1 and compression level 0 to 2 (got {got})")
+    (stated,) = struct.unpack_from("<I", data, 16)
     least, most = struct.unpack_from("<2f", data, 36)
     sh_range = least or -_HALF_RANGE, most or _HALF_RANGE
     start, found = _HEADER + sections * _SECTION_HEADER, []
@@ -72,6 +73,8 @@ def read_ksplat(data: bytes) -> KsplatRows:
         raise InputError("sections of ksplat files must have the same SH degree")
     if not found:
         raise InputError("not a valid ksplat file (it has no sections)")
+    if (count := sum(len(rows.means) for rows in found)) != stated:
+        raise InputError(f"the sections of a ksplat file must hold all {stated} Gaussians of its header (got {count})")
     return KsplatRows(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
 
 

@@ -12,7 +12,7 @@ from scipy.special import logit
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_arrays import SplatArrays, exponential, sigmoid
-from mitsplat.gaussians.splat_checks import check_colour_space, check_encoding, colours_differ
+from mitsplat.gaussians.splat_checks import are_colours, check_colour_space, check_encoding, colours_differ
 from mitsplat.gaussians.splat_converter import convert_apart
 from mitsplat.gaussians.splat_training import merge_filter, ply_comment, ply_kernel
 from mitsplat.quality import KernelName
@@ -29,11 +29,15 @@ _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 MAX_PLY_HEADER = 1 << 16
 _MEANS, _QUATS, _SCALES = ("x", "y", "z"), ("rot_1", "rot_2", "rot_3", "rot_0"), ("scale_0", "scale_1", "scale_2")
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
+_CHUNK_SIZE = 256
+"""Number of Gaussians of a chunk of compressed PLY files."""
 _CHUNK_COLUMNS = 12
 """Columns of the chunks of compressed PLY files without ranges of colours."""
 _COLOUR_RANGES = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
 _FLAT_THICKNESS = np.float32(0.01)
 """Third scale of flat Gaussians that have none, relative to the smaller of the others."""
+_LEAST_LOGARITHM = -80.0
+"""Logarithm of scales below which 32-bit numbers lose them; files with larger ones in no row hold flat Gaussians."""
 _FILTER = "filter_3D"
 _USED = re.compile(rf"[xyz]|f_dc_[012]|f_rest_\d+|opacity|scale_[012]|rot_[0123]|{_FILTER}")
 _COLOURS = ("red", "green", "blue")
@@ -52,16 +56,11 @@ def decode_ply(data: bytes) -> SplatArrays:
     if "packed_position" in names:
         return decode_ply(convert_apart(_with_colour_ranges(data, form, elements, start), "compressed.ply", "ply"))
     scale_names = _SCALES if _SCALES[2] in names else _SCALES[:2]  # 2DGS has two
-    missing = [n for n in (*_MEANS, *_COLOUR, "opacity", *scale_names, *_QUATS) if n not in names]
-    if missing:
-        cause = ": export coefficients in place of red, green, blue" if {"red", "f_dc_0"} <= {*names, *missing} else ""
-        raise InputError(f"a PLY file of splats must have the vertex properties {', '.join(missing)} (missing){cause}")
-    rest = sum(name.startswith("f_rest_") for name in names)
-    rest_names = [f"f_rest_{i}" for i in range(rest)]
-    if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
-        raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
+    _check_names(names, scale_names)
     rows = vertex_rows(data, form, elements, start)
     check_encoding(*(columns_of(rows, names) for names in (_MEANS, scale_names, ("opacity",), _COLOUR)))
+    if len(scale_names) == 3 and len(rows) and rows[_SCALES[2]].max() < _LEAST_LOGARITHM:
+        scale_names = _SCALES[:2]  # a program added a scale of zero to flat Gaussians
     if form != "ascii":
         check_colour_space(data, elements, start)
     scales, opacities = exponential(columns_of(rows, scale_names)), sigmoid(rows["opacity"])
@@ -72,8 +71,9 @@ def decode_ply(data: bytes) -> SplatArrays:
             cause = "; are they logarithms?" if least < 0 else ""
             raise InputError(f"{_FILTER} must be standard deviations of at least 0 (got {least:.3g}){cause}")
         scales, opacities = merge_filter(scales, opacities, rows[_FILTER])
+    rest_names = [f"f_rest_{index}" for index in range(sum(name.startswith("f_rest_") for name in names))]
     # SH coefficients are channel-major: all of red, then green, then blue.
-    higher = columns_of(rows, rest_names).reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)
+    higher = columns_of(rows, rest_names).reshape(len(rows), 3, len(rest_names) // 3).transpose(0, 2, 1)
     return SplatArrays(
         means=columns_of(rows, _MEANS),
         quats=columns_of(rows, _QUATS),
@@ -83,9 +83,33 @@ def decode_ply(data: bytes) -> SplatArrays:
     )
 
 
+def _check_names(names: tuple[str, ...], scale_names: tuple[str, ...]) -> None:
+    """Raise InputError if properties of the vertices are missing or of another number than SH coefficients."""
+    missing = [n for n in (*_MEANS, *_COLOUR, "opacity", *scale_names, *_QUATS) if n not in names]
+    if missing:
+        cause = ": export coefficients in place of red, green, blue" if {"red", "f_dc_0"} <= {*names, *missing} else ""
+        raise InputError(f"a PLY file of splats must have the vertex properties {', '.join(missing)} (missing){cause}")
+    rest = sum(name.startswith("f_rest_") for name in names)
+    rest_names = [f"f_rest_{i}" for i in range(rest)]
+    if rest not in (0, 9, 24, 45) or not set(rest_names) <= set(names):
+        raise InputError(f"f_rest must be numbered from 0 and have 0, 9, 24 or 45 properties (got {rest})")
+
+
 def _with_colour_ranges(data: bytes, form: str, elements: PlyElements, start: int) -> bytes:
-    """Return a compressed PLY file with ranges of colours in its chunks. Early files have none, which means 0 to 1."""
+    """Return a compressed PLY file with ranges of colours in its chunks. Early files have none, which means 0 to 1.
+
+    Raises:
+        InputError: If the numbers of chunks or of coefficients contradict the number of Gaussians.
+    """
     count, row = elements.get("chunk", (0, np.dtype([])))
+    gaussians = elements["vertex"][0]
+    if count != -(-gaussians // _CHUNK_SIZE):
+        raise InputError(
+            f"compressed PLY files must have a chunk for every {_CHUNK_SIZE} of their {gaussians} "
+            f"Gaussians (got {count} chunks)"
+        )
+    if (rows := elements.get("sh", (gaussians,))[0]) != gaussians:
+        raise InputError(f"element sh must have a row for each of the {gaussians} Gaussians (got {rows})")
     end = start + count * row.itemsize
     is_early = next(iter(elements)) == "chunk" and len(row.names or ()) == _CHUNK_COLUMNS and form != "ascii"
     if not is_early or row.itemsize != 4 * _CHUNK_COLUMNS or not len(data) >= end > start:
@@ -133,12 +157,17 @@ def examine_columns(data: bytes) -> tuple[list[str], KernelName | None]:
     warnings = []
     if unused := [name for name in names if name not in _REDUNDANT and not _USED.fullmatch(name)]:
         warnings.append(f"the columns {', '.join(unused)} are not used")
-    if set(_COLOURS) <= set(names):
-        rows = vertex_rows(data, form, elements, start)
-        if colours_differ(columns_of(rows, _COLOURS), columns_of(rows, _COLOUR)):
-            warnings.append(
-                "its columns red, green, blue differ from its coefficients f_dc_0 to f_dc_2, which are used"
-            )
+    if (extra := _extra_rows(data, form, elements, start)) > 0:
+        stated_count = elements["vertex"][0]
+        warnings.append(f"{extra} rows after the {stated_count} Gaussians that its header states are not used")
+    rows = vertex_rows(data, form, elements, start)
+    if are_colours(columns_of(rows, _COLOUR)):
+        warnings.append(
+            "its coefficients f_dc_0 to f_dc_2 lie in 0 to 1, which makes all colours pale: if they are colours, "
+            "convert them by (c - 0.5) / 0.2821"
+        )
+    if set(_COLOURS) <= set(names) and colours_differ(columns_of(rows, _COLOURS), columns_of(rows, _COLOUR)):
+        warnings.append("its columns red, green, blue differ from its coefficients f_dc_0 to f_dc_2, which are used")
     return warnings, stated or ("mip" if _FILTER in names else "exact" if _SCALES[2] not in names else None)
 
 
@@ -184,9 +213,9 @@ def vertex_rows(data: bytes, form: str, elements: PlyElements, start: int) -> np
     """
     before = [elements[name] for name in list(elements)[: list(elements).index("vertex")]]
     count, row = elements["vertex"]
-    if row.hasobject or any(kind.hasobject for _, kind in before) or (before and form == "ascii"):
+    if row.hasobject or (any(kind.hasobject for _, kind in before) and form != "ascii"):
         raise InputError("a PLY file of splats must not have list properties in or before its vertices")
-    start += sum(number * kind.itemsize for number, kind in before)
+    start += sum(number * kind.itemsize for number, kind in before) if form != "ascii" else 0
     # In a text file, a number takes at least one digit and one separator.
     smallest = count * (row.itemsize if form != "ascii" else 2 * len(row.names or ()))
     present = max(0, len(data) - start + (form == "ascii"))
@@ -194,12 +223,44 @@ def vertex_rows(data: bytes, form: str, elements: PlyElements, start: int) -> np
         raise InputError(f"the PLY header states {count} Gaussians in at least {smallest} bytes (got {present} bytes)")
     if form != "ascii":
         return np.frombuffer(data, row, count, start) if count else np.empty(0, row)
+    first = sum(number for number, _ in before)
+    lines = [line.split() for line in text_lines(data, start)[first : first + count]]
     width = len(row.names or ())
-    words = data[start:].split(maxsplit=count * width)[: count * width]
-    if len(words) < count * width:
-        raise InputError(f"the PLY header states {count} Gaussians of {width} numbers (got {len(words)} numbers)")
-    numbers = np.array(words, dtype=np.bytes_).astype(np.float64)
-    return numbers.view([(name, np.float64) for name in row.names or ()])
+    for number, words in enumerate(lines):
+        if len(words) != width:
+            raise InputError(f"row {number} of the vertices must have {width} numbers (got {len(words)} numbers)")
+    if len(lines) < count:
+        raise InputError(f"the PLY header states {count} Gaussians of {width} numbers (got {len(lines)} rows)")
+    table = np.array(lines, dtype=np.bytes_).reshape(count, width)
+    try:
+        numbers = table.astype(np.float64)
+    except ValueError:
+        wrong = next(word for words in lines for word in words if not _is_number(word)).decode("ascii", "replace")
+        raise InputError(f"vertices must be numbers with a decimal point (could not convert {wrong!r})") from None
+    return numbers.ravel().view([(name, np.float64) for name in row.names or ()])
+
+
+def text_lines(data: bytes, start: int) -> list[bytes]:
+    """Return the lines of a text file from an offset that are not empty."""
+    return [line for line in data[start:].splitlines() if line.strip()]
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _extra_rows(data: bytes, form: str, elements: PlyElements, start: int) -> int:
+    """Return the number of rows after the stated number of vertices, which are the last element."""
+    if list(elements)[-1] != "vertex" or (form != "ascii" and any(kind.hasobject for _, kind in elements.values())):
+        return 0
+    if form == "ascii":
+        return len(text_lines(data, start)) - sum(count for count, _ in elements.values())
+    rest = len(data) - start - sum(count * kind.itemsize for count, kind in elements.values())
+    return rest // elements["vertex"][1].itemsize
 
 
 def columns_of(rows: npt.NDArray[np.void], names: tuple[str, ...] | list[str]) -> Float32Array:

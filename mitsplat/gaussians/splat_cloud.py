@@ -137,7 +137,7 @@ class Splats:
         try:
             splats = cls(**arrays._asdict(), kernel=kernel)
         except ValueError as error:
-            remedy = ": remove such Gaussians, as SuperSplat and splat-transform do" if "got nan" in str(error) else ""
+            remedy = ": remove such Gaussians, as SuperSplat and splat-transform do" if " at row " in str(error) else ""
             raise InputError(f"{path}: {error}{remedy}") from error
         if materials is not None:
             splats = replace(splats, materials=read_materials(Path(materials), len(splats)))

@@ -13,7 +13,7 @@ suffix                  read  write  precision
 ======================  ====  =====  ==========================================================================
 
 Few files state their axes and none its unit, so ``x, y, z`` are returned as in the file, without rotation or scaling.
-This package decodes ``.ply``, ``.splat``, ``.ksplat`` and version 3 of ``.spz``. Its allocations are
+This package decodes ``.ply``, ``.splat``, ``.ksplat``, ``.sog`` and version 3 of ``.spz``. Its allocations are
 limited by the size of the file. gaussforge decodes the other formats. It does not validate its input and therefore
 runs in a separate process with bounded memory, which takes 0.1 s to start.
 """
@@ -31,10 +31,10 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.gaussians.ksplat_files import read_ksplat
 from mitsplat.gaussians.ply_files import MAX_PLY_HEADER, decode_ply, encode_ply, examine_columns
+from mitsplat.gaussians.sog_files import decode_sog
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_arrays import SplatArrays
-from mitsplat.gaussians.splat_converter import convert_apart
-from mitsplat.gaussians.splat_training import sog_kernel
+from mitsplat.gaussians.splat_checks import check_precision
 from mitsplat.gaussians.spz_files import decode_spz, encode_spz
 from mitsplat.quality import KernelName
 from mitsplat.storage.file_kinds import kind_of_file, refuse_placeholder
@@ -44,6 +44,9 @@ Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
 _CONVERTED = (".ksplat", ".spz", ".sog")
 _SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+_STARTS = {b"ply\n": ".ply", b"ply\r": ".ply", b"NGSP": ".spz", b"PK\3\4": ".sog", b"glTF": ".glb"}
+"""First bytes of files by suffix."""
 
 _logger = logging.getLogger(__name__)
 
@@ -87,20 +90,29 @@ def read_splats(path: Path) -> tuple[SplatArrays, KernelName | None]:
     try:
         if not data:
             raise InputError("the file is empty")
-        if suffix == ".splat":
-            return _decode_splat(data), None
-        if suffix == ".spz":
-            return decode_spz(data)
-        if suffix == ".sog":
-            return decode_ply(convert_apart(data, "sog", "ply")), sog_kernel(data)
-        if suffix == ".ksplat":
-            return _decode_ksplat(data), None
-        arrays, (warnings, kernel) = decode_ply(data), examine_columns(data)
+        if (kind := _STARTS.get(data[:4], suffix)) != suffix:
+            raise InputError(f"a {suffix} file must not begin as a {kind} file: rename it if it is one")
+        arrays, kernel, warnings = _decode(data, suffix)
+        check_precision(arrays.means, arrays.scales)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
     for warning in warnings:
         _logger.warning("%s: %s", path, warning)
     return arrays, kernel
+
+
+def _decode(data: bytes, suffix: str) -> tuple[SplatArrays, KernelName | None, list[str]]:
+    """Decode a file of a known suffix; return its arrays, the kernel of the training, and warnings."""
+    if suffix == ".splat":
+        return _decode_splat(data), None, []
+    if suffix == ".spz":
+        return *decode_spz(data), []
+    if suffix == ".sog":
+        return *decode_sog(data), []
+    if suffix == ".ksplat":
+        return _decode_ksplat(data), None, []
+    arrays, (warnings, kernel) = decode_ply(data), examine_columns(data)
+    return arrays, kernel, warnings
 
 
 def write_splats(splats: SplatArrays, path: Path, kernel: KernelName | None = None) -> None:

@@ -17,11 +17,8 @@ that denies it was trained with dilated footprints, as kernel ``gsplat`` has. ``
 
 from __future__ import annotations
 
-import json
 import re
-import zipfile
 from collections.abc import Iterable
-from io import BytesIO
 
 import numpy as np
 import numpy.typing as npt
@@ -65,19 +62,6 @@ def spz_kernel(header: bytes) -> KernelName | None:
     """Return the kernel that the header of an SPZ file states; without the flag it is unknown, as writers omit it."""
     is_set = len(header) > SPZ_FLAGS_OFFSET and header[SPZ_FLAGS_OFFSET] & SPZ_ANTIALIASED
     return "mip" if is_set else None
-
-
-def sog_kernel(data: bytes) -> KernelName | None:
-    """Return the kernel that ``meta.json`` of a valid SOG archive states."""
-    with zipfile.ZipFile(BytesIO(data)) as archive:
-        names = [name for name in archive.namelist() if name.rpartition("/")[2] == "meta.json"]
-        try:
-            meta = json.loads(archive.read(names[0])) if names else {}
-        except RecursionError:
-            meta = {}
-    if not isinstance(meta, dict):
-        return None
-    return "mip" if meta.get("model") == "antialiased" or meta.get("antialias") is True else None
 
 
 def merge_filter(

@@ -1,4 +1,4 @@
-"""SPZ files of Gaussian splats (Niantic), version 3."""
+"""SPZ files of Gaussian splats (Niantic): versions 1 to 3 are read, version 3 is written."""
 
 from __future__ import annotations
 
@@ -22,25 +22,32 @@ _SPZ_HEADER = struct.Struct("<4s2I4B")
 _SPZ_FRACTIONAL_BITS = 12
 _SPZ_FRACTIONAL_BITS_OFFSET = 13
 _SPZ_POSITION_BITS = 23
+_SPZ_MAX_FRACTIONAL_BITS = 30
+_SPZ_EXTENDED = 0x2
+"""Flag of files with data after the Gaussians."""
+_SPZ_WIDTHS = {1: (6, 3), 2: (9, 3), 3: (9, 4)}
+"""Bytes of the position and of the rotation of a Gaussian by version."""
 
 
 def decode_spz(data: bytes) -> tuple[SplatArrays, KernelName | None]:
-    """Decode SPZ version 3 (Niantic's ``load-spz.cc``): consecutive arrays of small integers in gzip.
+    """Decode SPZ versions 1 to 3 (Niantic's ``load-spz.cc``): consecutive arrays of small integers in gzip.
 
-    The result is bit-identical to that of gaussforge, without a separate process. gaussforge decodes or refuses other
-    versions and files whose length does not match their header.
+    Version 3 is decoded here, bit-identical to gaussforge and without a separate process. gaussforge decodes the
+    others.
+
+    Raises:
+        InputError: If the data are damaged, of another version, or of a length that contradicts their header.
     """
     if data[:4] == b"NGSP":  # not in gzip since version 4
         version = int.from_bytes(data[4:8], "little")
         if version < 4:
             raise InputError(f"an SPZ file of version {version} must be compressed by gzip")
-        raise InputError(f"SPZ files of version {version} are not supported: convert them to version 3, or to .ply")
+        raise InputError(_unsupported(version))
     raw = _decompress_gzip(data)
-    magic, version, count, degree, bits, _, _ = _SPZ_HEADER.unpack(raw[: _SPZ_HEADER.size].ljust(_SPZ_HEADER.size))
-    widths = (9, 1, 3, 3, 4, 3 * (degree + 1) ** 2 - 3)
-    known = (magic, version) == (b"NGSP", 3) and count > 0 and degree <= 3 and bits <= _SPZ_POSITION_BITS
-    if not known or len(raw) != _SPZ_HEADER.size + count * sum(widths):
+    version, count, degree, bits = _check_header(raw)
+    if version < 3:
         return decode_ply(convert_apart(data, "spz", "ply")), spz_kernel(raw)
+    widths = (9, 1, 3, 3, 4, 3 * (degree + 1) ** 2 - 3)
     ends = _SPZ_HEADER.size + count * np.cumsum(widths)
     arrays = np.split(np.frombuffer(raw, np.uint8, ends[-1]), [_SPZ_HEADER.size, *ends[:-1]])[1:]
     positions, alphas, colours, scales, turns, rest = (a.reshape(count, -1).astype(np.int32) for a in arrays)
@@ -56,6 +63,36 @@ def decode_spz(data: bytes) -> tuple[SplatArrays, KernelName | None]:
         sh=np.concatenate([base[:, None], rest.reshape(count, -1, 3).astype(np.float32) / 128 - 1], axis=1),
     )
     return decoded, spz_kernel(raw)
+
+
+def _check_header(raw: bytes) -> tuple[int, int, int, int]:
+    """Return the version, number of Gaussians, SH degree and fractional bits of decompressed data.
+
+    The arrays follow each other without marks, so that a wrong number of Gaussians would mix them up.
+    """
+    magic, version, count, degree, bits, flags, _ = _SPZ_HEADER.unpack(raw[: _SPZ_HEADER.size].ljust(_SPZ_HEADER.size))
+    if magic != b"NGSP":
+        raise InputError(f"not a valid spz file (it must begin with NGSP, got {magic!r})")
+    if version not in _SPZ_WIDTHS:
+        raise InputError(_unsupported(version))
+    if degree > 3:
+        raise InputError(f"SPZ files must have SH of degree 0 to 3 (got {degree}): export a lower degree")
+    if bits > _SPZ_MAX_FRACTIONAL_BITS:
+        raise InputError(f"positions must have at most {_SPZ_MAX_FRACTIONAL_BITS} fractional bits (got {bits})")
+    if not count:
+        raise InputError("an SPZ file must hold at least one Gaussian (got 0)")
+    position, rotation = _SPZ_WIDTHS[version]
+    size = _SPZ_HEADER.size + count * (position + 7 + rotation + 3 * (degree + 1) ** 2 - 3)
+    if len(raw) < size or (len(raw) > size and not flags & _SPZ_EXTENDED):
+        raise InputError(
+            f"{count} Gaussians of SH degree {degree}, as the header states, must take {size} bytes (got {len(raw)}): "
+            "is the file damaged?"
+        )
+    return version, count, degree, bits
+
+
+def _unsupported(version: int) -> str:
+    return f"SPZ files of version {version} are not supported: convert them to version 3, or to .ply"
 
 
 def _smallest_three(packed: npt.NDArray[np.uint32]) -> Float32Array:

@@ -80,6 +80,7 @@ def test_all_levels_and_degrees_are_read_within_their_quantisation(tmp_path: Pat
         (4, b"\xff", "the headers of its sections are incomplete"),
         (4096 + 40, b"\3", r"SH of degree 0 to 2 \(got 3\)"),
         (4096 + 32, b"\1", "the buckets of a section do not hold its Gaussians"),
+        (16, b"\x2d", r"hold all 301 Gaussians of its header \(got 300\)"),
         (4096 + 4, b"\xff\xff", "a section extends beyond the file"),
     ],
 )

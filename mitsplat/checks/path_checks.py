@@ -16,6 +16,7 @@ from scipy.spatial import QhullError
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import ASSET_FILE, Asset, opaque_core
 from mitsplat.checks.exposure_check import check_exposure
+from mitsplat.checks.lamp_check import check_lamps
 from mitsplat.dataset.preflight import run_faults, scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
@@ -257,6 +258,7 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
         "light", lit, f"{len(spec.lights)} lights", "add one to lights, or set capture_light: scene in assets"
     )
     if lit and not faults:
+        yield from check_lamps(scene)
         yield check_exposure(scene)
 
 

@@ -66,6 +66,9 @@ def test_drawn_lights_come_from_all_sides_within_their_ranges(lit: Any) -> None:
     spread(away, 0.5, 2.0)
     spread(arms[:, 2] / away, *np.sin(np.radians([10, 80])))
     spread(np.degrees(np.arctan2(arms[:, 1], arms[:, 0])) % 360, 0, 360)
+    before = lights_of(lit(SIDES | {"draw": SIDES["draw"] | {"count": 1, "azimuth": [180, 300]}}))[::2]
+    arms = np.array([light.position for lights in before for light in lights]) - SIDES["target"]
+    spread(np.degrees(np.arctan2(arms[:, 1], arms[:, 0])) % 360, 180, 300)
     for side in range(2):
         spread([light.size[side] for light in areas], *np.array(SIDES["draw"]["size"])[:, side])
     spread([light.radiance for light in areas], 5, 20)
@@ -178,6 +181,10 @@ def test_lights_that_may_be_inside_of_a_shape_get_a_warning(lit: Any) -> None:
         (
             {"kind": "area", "position": [0, 0, 1], "draw": {"elevation": [0, 90]}},
             "lights[0].draw.elevation: needs a distance",
+        ),
+        (
+            {"kind": "area", "position": [0, 0, 1], "draw": {"azimuth": [0, 90]}},
+            "lights[0].draw.azimuth: needs a distance",
         ),
         ({"kind": "area", "draw": {"distance": [0, 2]}}, "lights[0].draw.distance[0]: must be > 0 (got 0)"),
         (

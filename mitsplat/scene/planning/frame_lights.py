@@ -74,7 +74,7 @@ def _draw_values(light: LightSpec, draw: LightDraw, seed: int, name: str, number
         state["colour"] = tuple((one + uniform("colour", 0.0, 1.0) * (other - one)).tolist())
     if draw.distance is not None:
         target: Any = getattr(light, "target", (0.0, 0.0, 0.0))
-        azimuth = np.radians(uniform("azimuth", 0.0, 360.0))
+        azimuth = np.radians(uniform("azimuth", *draw.azimuth))
         # Uniform by area on the sphere: the sine of the elevation is uniform (Archimedes).
         sine = uniform("elevation", *np.sin(np.radians(draw.elevation)))
         offset = uniform("distance", *draw.distance) * direction(azimuth, sine)

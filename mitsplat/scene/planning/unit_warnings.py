@@ -117,7 +117,7 @@ def _angle_warnings(spec: SceneSpec) -> Iterator[Finding]:
         if isinstance(light, SpotLight):
             flat.append((f"{key}.cone", (light.cone,)))
         if isinstance(light, DrawnLight) and light.draw is not None:
-            turns.append((f"{key}.draw.rotate_z", light.draw.rotate_z or ()))
+            turns += [(f"{key}.draw.rotate_z", light.draw.rotate_z or ()), (f"{key}.draw.azimuth", light.draw.azimuth)]
             flat.append((f"{key}.draw.elevation", light.draw.elevation))
     for key, angles in turns:
         if any(map(_is_radian, angles)):

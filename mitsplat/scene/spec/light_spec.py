@@ -44,9 +44,15 @@ class LightDraw(StrictModel):
     distance: PositiveRange | None = Field(
         None,
         description="Distance from the target of the light [m], or from the origin if it has none, in place of "
-        "``position``. The direction is uniform by area on the part of the sphere that ``elevation`` selects.",
+        "``position``. The direction is uniform by area on the part of the sphere that ``elevation`` and ``azimuth`` "
+        "select.",
     )
     elevation: ElevationRange = Field((15.0, 85.0), description="Elevation above the horizon [degrees].")
+    azimuth: Range = Field(
+        (0.0, 360.0),
+        description="Azimuth, 0 along +x, counter-clockwise seen from above [degrees]; for surroundings with a wall, "
+        "the sides without the wall.",
+    )
     size: SizeRange | None = Field(None, description="Width and height [m].")
     radiance: PositiveRange | None = Field(
         None, description="Radiance [W/(m^2 sr)], or the factor on an environment image."
@@ -58,7 +64,7 @@ class LightDraw(StrictModel):
     rotate_z: Range | None = Field(None, description="Rotation about the vertical axis [degrees].")
 
 
-_DRAW_ONLY_KEYS = frozenset({"vary", "count", "distance", "elevation"})
+_DRAW_ONLY_KEYS = frozenset({"vary", "count", "distance", "elevation", "azimuth"})
 """Keys of a draw that lights themselves do not have."""
 
 
@@ -77,8 +83,9 @@ class DrawnLight(StrictModel):
                 raise FieldError(("draw", key), f"is not a key of lights of kind {getattr(self, 'kind', '')}")
         if self.draw.distance is not None and self.draw.position is not None:
             raise FieldError(("draw", "distance"), "must not be given together with position")
-        if "elevation" in self.draw.model_fields_set and self.draw.distance is None:
-            raise FieldError(("draw", "elevation"), "needs a distance")
+        for key in ("elevation", "azimuth"):
+            if key in self.draw.model_fields_set and self.draw.distance is None:
+                raise FieldError(("draw", key), "needs a distance")
         if getattr(self, "path", ()):
             raise FieldError("draw", "must not be given together with a path")
         return self

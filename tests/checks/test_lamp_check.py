@@ -1,0 +1,44 @@
+"""Lamps that a wall of the surroundings hides from the objects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import trimesh
+
+from mitsplat.checks.lamp_check import check_lamps
+from mitsplat.scene.loading.scene_loading import load_scene
+from tests.conftest import WriteScene, box_asset
+
+WALL = trimesh.creation.box((8, 0.1, 8), transform=trimesh.transformations.translation_matrix((0, 0.6, 0)))
+"""A wall behind the objects, at y from 0.55 to 0.65 m."""
+
+ROUND: dict[str, Any] = {"kind": "area", "draw": {"distance": [4, 4], "elevation": [10, 20]}}
+"""Lamps on all sides; those of azimuths from 9 to 171 degrees are behind the wall, 45 % of all."""
+
+PATH = {"kind": "point", "position": [0, 0.3, 0.5], "path": [{"position": [0, -1, 0.5]}, {"position": [0, 2, 0.5]}]}
+"""A lamp that moves through the wall, behind which it is for half of its path."""
+
+
+@pytest.mark.parametrize(
+    ("light", "hidden"),
+    [
+        (ROUND, True),
+        ({"kind": "area", "draw": ROUND["draw"] | {"azimuth": [180, 360]}}, False),
+        ({"kind": "point", "position": [0, 1, 0.5]}, True),
+        ({"kind": "point", "position": [0, -1, 0.5]}, False),
+        (PATH, True),
+    ],
+    ids=["all sides", "front", "behind", "before", "path through the wall"],
+)
+def test_lamps_behind_a_wall_are_reported(
+    scene_data: dict[str, Any], write_scene: WriteScene, light: dict[str, Any], hidden: bool
+) -> None:
+    scene = load_scene(write_scene(scene_data | {"lights": [{"kind": "environment"}, light]}))
+    assert not list(check_lamps(scene))  # there are no surroundings
+    (finding,) = list(check_lamps(replace(scene, environments=(replace(box_asset("room"), mesh=WALL),)))) or (None,)
+    assert (finding is not None) == hidden
+    if finding is not None:
+        assert not finding.ok and finding.text.startswith("lights[1]: the environment hides ")

@@ -212,11 +212,11 @@ def _read_labelled(folder: Path) -> None:
 
 
 def _transforms(folder: Path) -> None:
-    from mitsplat.capture import known_poses as poses
+    from mitsplat.capture.nerf_transforms import parse_transforms, read_transforms
 
     path = folder / "transforms.json"
-    content = poses._parse_transforms(path)
-    poses._read_transforms(path, content, {frame.file_path: (32, 24) for frame in content.frames})
+    content = parse_transforms(path)
+    read_transforms(path, content, {frame.file_path: (32, 24) for frame in content.frames})
 
 
 def _colmap(folder: Path) -> None:

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import json
+import logging
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated
 
 import numpy as np
 from PIL import Image, ImageOps
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mitsplat.capture.name_matching import match_names
+from mitsplat.capture.nerf_transforms import Transforms, parse_transforms, read_transforms, transforms_remarks
 from mitsplat.capture.photos import Prepared, shapes_differ, turn_upright, with_orientation
 from mitsplat.capture.structure_from_motion import SparseModel, find_points, read_colmap_model
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.images.colour import LUMINANCE, eight_bit
 from mitsplat.progress import Progress
+from mitsplat.storage.calibration_files import refuse_calibration
 
-_Row = tuple[float, float, float, float]
-_Positive = Annotated[float, Field(gt=0)]
-
+_logger = logging.getLogger(__name__)
 
 MIN_REGISTERED = 0.75
 """Minimum fraction of photos with a camera for a successful capture."""
@@ -33,6 +30,10 @@ _MAX_COORDINATE = 1e9
 """Largest accepted coordinate of a camera or a point, in units of the model; geocentric coordinates in metres reach
 6e6.
 """
+_MAX_OBLONG = 1.2
+"""Ratio of the focal lengths along x and y above which they are named."""
+_MAX_OFFSET = 0.2
+"""Distance of a principal point from the middle of the image above which it is named, in image sizes."""
 _FIRST_TURNED = 5
 """First EXIF orientation that exchanges width and height."""
 _MIN_COLOURS = 20
@@ -41,45 +42,6 @@ _MIN_CORRELATION = 0.5
 """Minimum correlation of the luminances of points and photo."""
 _MAX_UNEXPLAINED = 0.6
 """Maximum ratio of the unexplained variances of the luminances, right orientation against wrong."""
-
-
-class _Lens(BaseModel):
-    """Intrinsics of all frames or of one frame; pixel centres are at +0.5, by the convention of COLMAP."""
-
-    model_config = ConfigDict(allow_inf_nan=False)
-
-    camera_angle_x: _Positive | None = None
-    camera_angle_y: _Positive | None = None
-    fl_x: _Positive | None = None
-    fl_y: _Positive | None = None
-    cx: float | None = None
-    cy: float | None = None
-    w: _Positive | None = None
-    h: _Positive | None = None
-    k1: float = 0.0
-    k2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k5: float = 0.0
-    k6: float = 0.0
-    distortion_params: list[float] = []
-    camera_model: str = "OPENCV"
-    is_fisheye: bool = False
-
-
-_MIN_CENTRE, _MIN_FOCAL = (0.25, 0.1), 0.1
-"""Minimum distance of a principal point from the border without and with a stated size, and focal length [sizes]."""
-
-
-class _Frame(_Lens):
-    file_path: str
-    transform_matrix: tuple[_Row, _Row, _Row, _Row]
-
-
-class _Transforms(_Lens):
-    frames: list[_Frame] = Field(min_length=1)
 
 
 def read_poses(
@@ -113,17 +75,20 @@ def read_poses(
     """
     by_name = {photo.name: photo for photo in photos}
     everything = [*by_name, *unusable]
+    refuse_calibration(source, "poses must be the folder of a COLMAP model or a transforms.json")
     if source.is_dir():
         model = read_colmap_model(source, folder / "given")
         paths = {name: PurePosixPath(name.replace("\\", "/")) for name in model.cameras}
         names = match_names(source, paths, base, everything)
         sized = set(model.cameras)
     elif source.suffix == ".json":
-        content = _parse_transforms(source)
+        content = parse_transforms(source)
+        for remark in transforms_remarks(content):
+            _logger.warning("%s: %s", source, remark)
         paths = _frame_paths(source, content)
         names = match_names(source, paths, base, everything)
         sizes = {name: by_name[photo].size for name, photo in names.items() if photo in by_name}
-        model, sized = _read_transforms(source, content, sizes)
+        model, sized = read_transforms(source, content, sizes)
     else:
         raise InputError(f"{source}: poses must be the folder of a COLMAP model or a transforms.json")
     matched = {name: by_name[photo] for name, photo in names.items() if photo in by_name and name in model.cameras}
@@ -132,6 +97,8 @@ def read_poses(
         named = f"it names {first}, and a photo is {next(iter(everything), 'missing')}"
         raise InputError(f"{source}: must name at least two of the photos (got {len(matched)}; {named})")
     _check_coordinates(source, model)
+    for remark in _lens_remarks(model, matched):
+        _logger.warning("%s: %s", source, remark)
     upright = _upright_photos(source, model, matched, sized)
     matched |= {name: turn_upright(photo) for name, photo in matched.items() if photo.name in upright}
     cameras = {
@@ -160,14 +127,14 @@ def unnamed_photos(source: Path, photos: Sequence[str], base: Path) -> list[str]
     """
     if source.is_dir() or source.suffix != ".json":
         return []
-    paths = _frame_paths(source, _parse_transforms(source))
+    paths = _frame_paths(source, parse_transforms(source))
     named = set(match_names(source, paths, base, photos).values())
     if len(named) < MIN_REGISTERED * min(len(paths), len(photos)):
         return []
     return [photo for photo in photos if photo not in named]
 
 
-def _frame_paths(source: Path, content: _Transforms) -> dict[str, PurePosixPath]:
+def _frame_paths(source: Path, content: Transforms) -> dict[str, PurePosixPath]:
     """Return the path of each image of a ``transforms.json``; its paths are relative to the file."""
     return {frame.file_path: _below(source.resolve().parent, frame.file_path) for frame in content.frames}
 
@@ -243,6 +210,25 @@ def _coloured_upright(model: SparseModel, name: str, photo: Prepared) -> bool | 
     return fits[1] == right
 
 
+def _lens_remarks(model: SparseModel, names: Collection[str]) -> Iterator[str]:
+    """Yield a sentence for the first camera of each kind of implausible intrinsics."""
+    cameras = [(name, camera) for name, camera in model.cameras.items() if name in names]
+    for name, camera in cameras:
+        if (ratio := max(camera.fx / camera.fy, camera.fy / camera.fx)) > _MAX_OBLONG:
+            yield (
+                f"{name}: fx = {camera.fx:g} and fy = {camera.fy:g} differ by a factor of {ratio:.3g}: is one of them "
+                "of another image size? Most cameras have square pixels"
+            )
+            break
+    for name, camera in cameras:
+        if max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5)) > _MAX_OFFSET:
+            yield (
+                f"{name}: the principal point cx, cy = {camera.cx:g}, {camera.cy:g} is far from the middle of the "
+                f"image of {camera.width}x{camera.height} px: are they of another image size, or is the photo cropped?"
+            )
+            break
+
+
 def _check_coordinates(source: Path, model: SparseModel) -> None:
     """Raise InputError if a camera or a point of the model is not finite or lies beyond ``_MAX_COORDINATE``."""
     places = [(f"camera {name}", camera.world_from_camera[:3, 3]) for name, camera in model.cameras.items()]
@@ -250,108 +236,6 @@ def _check_coordinates(source: Path, model: SparseModel) -> None:
     for name, place in places:
         if not (farthest := float(np.abs(place).max())) <= _MAX_COORDINATE:
             raise InputError(f"{source}: {name} must lie within {_MAX_COORDINATE:g} of the origin (got {farthest:g})")
-
-
-def _parse_transforms(path: Path) -> _Transforms:
-    """Read a ``transforms.json``."""
-    try:
-        return _Transforms.model_validate_json(path.read_bytes())
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "content"
-        raise InputError(
-            f"{path}: {place}: {first['msg']} (got {json.dumps(first['input'], default=str):.60})"
-        ) from None
-
-
-def _read_transforms(
-    path: Path, content: _Transforms, sizes: Mapping[str, tuple[int, int]]
-) -> tuple[SparseModel, set[str]]:
-    """Return the cameras of a ``transforms.json`` by its file paths, and the paths for which it states the size.
-
-    Frames without a size have that of their photo in ``sizes``, and are left out if they have none.
-    """
-    cameras: dict[str, Camera] = {}
-    sized = set()
-    for number, frame in enumerate(content.frames):
-        lens = _lens_of(content, frame)
-        width, height = lens.w, lens.h
-        if width is None or height is None:
-            if frame.file_path not in sizes:
-                continue  # not among the photos; its size is unknown and not needed
-            width, height = sizes[frame.file_path]
-        else:
-            sized.add(frame.file_path)
-        try:
-            camera = _camera(lens, round(width), round(height), np.array(frame.transform_matrix))
-        except ValueError as error:
-            raise InputError(f"{path}: frames[{number}]: {error}") from error
-        across, least = (camera.cx / width, camera.cy / height), _MIN_CENTRE[frame.file_path in sized]
-        if camera.fx / width < _MIN_FOCAL or not all(least < share < 1 - least for share in across):
-            raise InputError(
-                f"{path}: frames[{number}]: fl_x, cx, cy = {camera.fx:g}, {camera.cx:g}, {camera.cy:g} must be in "
-                f"pixels of a photo of {width:g} x {height:g}: state w and h, the size for which they hold"
-            )
-        other = cameras.setdefault(frame.file_path, camera)
-        if not np.array_equal(other.world_from_camera, camera.world_from_camera):
-            raise InputError(f"{path}: frames[{number}]: an image must have one pose (got two of {frame.file_path})")
-    empty = np.zeros((0, 3))
-    nothing = {name: np.zeros(0, dtype=np.int32) for name in cameras}
-    return SparseModel(cameras, empty, empty.astype(np.uint8), nothing), sized
-
-
-def _lens_of(content: _Transforms, frame: _Frame) -> _Lens:
-    """Return the lens of a frame: its own keys, and else those of all frames. A field of view is a focal length."""
-    common, own = content.model_dump(exclude_unset=True), frame.model_dump(exclude_unset=True)
-    if "camera_angle_x" in own and "fl_x" not in own:
-        common = {key: value for key, value in common.items() if key not in ("fl_x", "fl_y", "camera_angle_y")}
-    return _Lens.model_validate(common | own)
-
-
-def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Camera:
-    """Return the OpenCV camera of a frame, with the y and z axes of OpenGL negated."""
-    if lens.camera_model not in ("OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        raise ValueError(
-            f"camera_model must be OPENCV, OPENCV_FISHEYE or PINHOLE (got {lens.camera_model}): undistort the photos"
-        )
-    if lens.k5 or lens.k6 or any(lens.distortion_params):
-        raise ValueError("has distortion in k5, k6 or distortion_params, which are not read: state k1, k2, k3, p1, p2")
-    focal, focal_y = lens.fl_x, lens.fl_y
-    if focal is None:
-        if lens.camera_angle_x is None:
-            raise ValueError("needs fl_x or camera_angle_x")
-        focal = _focal(width, lens.camera_angle_x, "camera_angle_x")
-        if focal_y is None and lens.camera_angle_y is not None:
-            focal_y = _focal(height, lens.camera_angle_y, "camera_angle_y")
-    fisheye = lens.camera_model == "OPENCV_FISHEYE" or lens.is_fisheye  # as instant-ngp states it
-    if lens.k4 and not fisheye:
-        raise ValueError(f"k4 belongs to camera_model OPENCV_FISHEYE (got {lens.camera_model})")
-    distortion = (lens.k1, lens.k2, lens.p1, lens.p2) + ((lens.k3,) if lens.k3 else ())
-    if fisheye:
-        distortion = (lens.k1, lens.k2, lens.k3, lens.k4)
-    pose = pose @ OPENCV_FROM_OPENGL
-    return Camera(
-        width=width,
-        height=height,
-        fx=float(focal),
-        fy=float(focal_y or focal),
-        cx=0.5 * width if lens.cx is None else lens.cx,
-        cy=0.5 * height if lens.cy is None else lens.cy,
-        world_from_camera=pose,
-        distortion=distortion if fisheye or any(distortion) else (),
-        lens="fisheye" if fisheye else "opencv",
-    )
-
-
-def _focal(size: float, angle: float, key: str) -> float:
-    """Return the focal length [px] of a field of view [rad] of ``size`` pixels."""
-    if not 0 < angle < np.pi:
-        raise ValueError(f"{key} must be 0 to pi radians (got {angle:g}: is it in degrees?)")
-    return float(0.5 * size / np.tan(0.5 * angle))
 
 
 def _size(camera: Camera) -> tuple[int, int]:

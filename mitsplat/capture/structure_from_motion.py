@@ -166,6 +166,10 @@ def read_colmap_model(source: Path, folder: Path) -> SparseModel:
     parts = [source / f"{name}{suffix}" for name in _MODEL_PARTS for suffix in (".bin", ".txt")]
     if odd := [path for path in parts if path.exists() and not path.is_file()]:
         raise InputError(f"{odd[0]}: must be a file")
+    if not any(path.exists() for path in parts):
+        raise InputError(
+            f"{source}: must hold the files cameras and images of a COLMAP model, as .bin or .txt (got none)"
+        )
     size = sum(path.stat().st_size for path in parts if path.exists())
     job = {"task": "read", "model": str(source), "memory": _READ_MEMORY + 100 * size}
     try:

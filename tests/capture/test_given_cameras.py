@@ -21,6 +21,7 @@ from mitsplat.capture import known_poses as poses
 from mitsplat.capture import structure_from_motion as sfm
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import read_poses
+from mitsplat.capture.nerf_transforms import parse_transforms, read_transforms
 from mitsplat.capture.photos import Prepared, mask_files, prepare_photos, read_mask, with_orientation
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
 from mitsplat.capture.pipeline.capture_result import CaptureResult
@@ -199,7 +200,7 @@ def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path
     lens = dict(zip(names, values, strict=True)) | {"w": 320, "h": 240, "camera_model": "OPENCV_FISHEYE"}
     (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": [frame]}))
     path = tmp_path / "transforms.json"
-    nerf = poses._read_transforms(path, poses._parse_transforms(path), {})[0].cameras["a.png"]
+    nerf = read_transforms(path, parse_transforms(path), {})[0].cameras["a.png"]
     for camera in (colmap, nerf):
         assert camera.lens == "fisheye"
         np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)
@@ -230,7 +231,7 @@ def test_lenses_of_instant_ngp_are_read(tmp_path: Path) -> None:
 
     def read(lens: dict[str, Any]) -> Camera:
         path.write_text(json.dumps(lens | {"w": 640, "h": 480, "frames": [frame]}))
-        return poses._read_transforms(path, poses._parse_transforms(path), {})[0].cameras["a.png"]
+        return read_transforms(path, parse_transforms(path), {})[0].cameras["a.png"]
 
     fisheye = read({"fl_x": 300, "k1": 0.02, "k2": 0.003, "is_fisheye": True})
     assert (fisheye.lens, fisheye.distortion) == ("fisheye", (0.02, 0.003, 0.0, 0.0))
@@ -264,7 +265,7 @@ def test_intrinsics_of_another_image_size_or_unit_are_refused(
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(lens | {"frames": [frame]}))
     with pytest.raises(InputError, match=re.escape(sentence)) if sentence else nullcontext():
-        poses._read_transforms(path, poses._parse_transforms(path), {"a.png": (640, 480)})
+        read_transforms(path, parse_transforms(path), {"a.png": (640, 480)})
 
 
 def small_model(folder: Path) -> tuple[Path, list[Prepared]]:
@@ -350,7 +351,7 @@ def test_paths_of_a_transforms_json_are_relative_to_it(tmp_path: Path) -> None:
     content = {"fl_x": 40, "w": 32, "h": 24, "frames": frames}
     path = folder / "transforms.json"
     path.write_text(json.dumps(content))
-    parsed = poses._parse_transforms(path)
+    parsed = parse_transforms(path)
     names = {frame.file_path: poses._below(path.parent, frame.file_path) for frame in parsed.frames}
     given = [f"{side}/{name}.png" for side in ("left", "right") for name in "ab"]
     assert poses.match_names(path, names, tmp_path / "rig", given) == {
@@ -360,7 +361,7 @@ def test_paths_of_a_transforms_json_are_relative_to_it(tmp_path: Path) -> None:
     frames[1]["file_path"] = ".\\a.png"
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"frames\[1\]: an image must have one pose \(got two of \.\\a\.png\)"):
-        poses._read_transforms(path, poses._parse_transforms(path), {})
+        read_transforms(path, parse_transforms(path), {})
 
 
 def turned_photos(folder: Path, orientation: int, size: tuple[int, int]) -> tuple[np.ndarray, list[Prepared]]:

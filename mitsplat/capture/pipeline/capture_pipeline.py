@@ -22,6 +22,7 @@ from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.geometric_masks import object_masks, object_points
 from mitsplat.capture.isolation import ChosenObject, occluded_part
 from mitsplat.capture.known_poses import read_poses, unnamed_photos
+from mitsplat.capture.nerf_transforms import check_metric
 from mitsplat.capture.photo_masks import add_masks, check_borders, cutout_masks, given_masks, model_masks, plain_masks
 from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
 from mitsplat.capture.pipeline.capture_result import CaptureResult
@@ -367,6 +368,8 @@ def _remove_faulty_cameras(model: SparseModel, least: int = MIN_POINTS) -> tuple
 
 def _metric_frame(model: SparseModel, by_file: dict[str, Prepared], settings: CaptureSettings) -> MetricFrame:
     if settings.metric:
+        if settings.poses is not None and settings.poses.suffix == ".json":
+            check_metric(settings.poses)
         return MetricFrame(np.eye(4), "metre", "z", table=True, source="the poses given")
     return find_metric_frame(
         model,

@@ -23,6 +23,7 @@ from mitsplat.scene.spec.object_spec import MAIN_REGION
 from mitsplat.scene.spec.scene_spec import SCHEMA_VERSION, SceneSpec
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import backdrop_shapes, enclosure_walls
+from mitsplat.storage.calibration_files import refuse_calibration
 from mitsplat.storage.file_kinds import refuse_other_kinds
 from mitsplat.storage.files import JsonObject
 from mitsplat.storage.yaml_input import key_place, load_yaml
@@ -47,6 +48,7 @@ def load_scene(
         InputError: If the scene file or a file that it names is missing or invalid.
     """
     path = path_of(path, "path")
+    refuse_calibration(path, "must be a scene file (.yaml)")
     refuse_other_kinds(path, "a scene file (.yaml)", ".yaml", ".yml")
     return _build_scene(load_yaml(path, SceneSpec, overrides=overrides), path, allow_outside=allow_outside)
 

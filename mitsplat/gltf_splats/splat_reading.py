@@ -21,8 +21,8 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.spz_files import decode_spz
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.geometry.untrusted_meshes import check_mesh, try_read
-from mitsplat.mesh_files.gltf import instance_poses, world_poses
 from mitsplat.mesh_files.gltf_data import GltfData
+from mitsplat.mesh_files.gltf_nodes import instance_poses, world_poses
 from mitsplat.storage.files import MESH_ERRORS, JsonObject
 
 GLTF_SUFFIXES = (".glb", ".gltf")

@@ -38,7 +38,8 @@ def find_reference(source: Path, name: str, kind: str, *, folder: Path | None = 
     if found is not None and is_inside(folder, str(found)):
         return found
     fault = "is missing" if is_inside(folder, str(base / plain)) else "is outside of its folder"
-    raise InputError(f"{source}: its {kind} {name} {fault}; put it there, or give a colour")
+    remedy = "" if kind == "buffer" else ", or give a colour"
+    raise InputError(f"{source}: its {kind} {name} {fault}; put it there{remedy}")
 
 
 def _in_other_case(folder: Path, name: str) -> Path | None:

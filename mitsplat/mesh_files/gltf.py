@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import AnyArray, Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.mesh_files.cut_outs import cut_out, opaque_texture
 from mitsplat.mesh_files.gltf_data import GltfData, normalised
+from mitsplat.mesh_files.gltf_nodes import instance_poses, world_poses
 from mitsplat.mesh_files.mesh_file import (
     DIELECTRIC_SPECULAR,
     LEAST_ROUGHNESS,
@@ -110,7 +110,8 @@ class _GltfReader:
             number = self._data.document.get("scene", 0)
             self._warnings.append(f"it has {len(scenes)} scenes, of which only scene {number} is read")
         parts = tuple(part for node, pose in self._world_poses.items() for part in self._read_node(node, pose))
-        return MeshFile(parts, 1.0, "y", tuple(dict.fromkeys(self._warnings)), in_single=True)
+        warnings = tuple(dict.fromkeys((*self._warnings, *self._data.warnings)))
+        return MeshFile(parts, 1.0, "y", warnings, in_single=True)
 
     @cached_property
     def _world_poses(self) -> dict[int, Float64Array]:
@@ -227,6 +228,8 @@ class _GltfReader:
         attributes = {}
         for name, index in primitive["attributes"].items():
             if name not in ("POSITION", "COLOR_0") and not name.startswith("TEXCOORD_"):
+                if "COLOR" in name.upper() and "COLOR_0" not in primitive["attributes"]:
+                    self._warnings.append(f"its vertex colours {name} are left out: only COLOR_0 is read")
                 continue
             if name not in decoded:
                 attributes[name] = self._data.accessor(index)
@@ -234,6 +237,10 @@ class _GltfReader:
                 attributes[name] = normalised(decoded[name])
             else:
                 attributes[name] = decoded[name]
+        for name, values in attributes.items():
+            if len(values) != len(attributes["POSITION"]):
+                count = len(attributes["POSITION"])
+                raise ValueError(f"{name} must have the {count} elements of POSITION (got {len(values)})")
         if indices is None and "indices" in primitive:
             indices = self._data.accessor(primitive["indices"])
         if indices is None:
@@ -314,54 +321,6 @@ class _GltfReader:
         return Texture(pixels, coordinates, (wrap_u, wrap_v))
 
 
-def world_poses(data: GltfData) -> dict[int, Float64Array]:
-    """Return the poses (4, 4) of all visible nodes of the scene, in depth-first order.
-
-    Raises:
-        ValueError: If a node has two parents.
-    """
-    document = data.document
-    poses: dict[int, Float64Array] = {}
-    nodes = document.get("nodes", [])
-    if "scenes" in document:
-        roots = data.entry("scenes", document.get("scene", 0)).get("nodes", [])
-    else:
-        inner = {child for node in nodes for child in node.get("children", [])}
-        roots = [index for index in range(len(nodes)) if index not in inner]
-    pending = [(root, np.eye(4)) for root in reversed(roots)]
-    while pending:
-        index, parent = pending.pop()
-        node = data.entry("nodes", index)
-        if index in poses:
-            raise ValueError(f"node {index} has two parents")
-        if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
-            continue
-        poses[index] = parent @ _local_pose(node)
-        pending += [(child, poses[index]) for child in reversed(node.get("children", []))]
-    return poses
-
-
-def instance_poses(data: GltfData, node: JsonObject) -> list[Float64Array]:
-    """Return the poses of the instances of a node, relative to it (``EXT_mesh_gpu_instancing``)."""
-    stored = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
-    if stored is None:
-        return [np.eye(4)]
-    given = {name.lower(): data.accessor(index) for name, index in stored["attributes"].items()}
-    count = min(map(len, given.values()))
-    return [_local_pose({name: values[k] for name, values in given.items()}) for k in range(count)]
-
-
-def _local_pose(node: JsonObject) -> Float64Array:
-    """Return the pose (4, 4) of a node relative to its parent."""
-    if "matrix" in node:
-        return np.asarray(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    pose = np.eye(4)
-    turn = Rotation.from_quat(np.asarray(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)).as_matrix()
-    pose[:3, :3] = turn * np.asarray(node.get("scale", (1, 1, 1)), dtype=np.float64)
-    pose[:3, 3] = node.get("translation", (0, 0, 0))
-    return pose
-
-
 def _moved(part: FilePart, vertices: Float64Array, pose: Float64Array) -> FilePart:
     return FilePart(part.name, vertices, part.faces, pose, part.material, part.colours, part.double_sided)
 
@@ -369,6 +328,8 @@ def _moved(part: FilePart, vertices: Float64Array, pose: Float64Array) -> FilePa
 def _triangles(indices: Int64Array, mode: int) -> Int64Array:
     """Return the faces (F, 3) of a list, strip or fan of triangles."""
     if mode == _TRIANGLES:
+        if len(indices) % 3:
+            raise ValueError(f"triangles need a multiple of 3 indices (got {len(indices)})")
         return indices.reshape(-1, 3)
     first = np.arange(max(0, len(indices) - 2))
     if mode == _FAN:

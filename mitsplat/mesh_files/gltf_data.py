@@ -9,7 +9,7 @@ import struct
 from functools import cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote_to_bytes
+from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 from PIL import Image
@@ -40,15 +40,17 @@ class GltfData:
     Attributes:
         path: The file.
         document: The JSON document.
+        warnings: Warnings of the data that were read, a sentence each.
     """
 
     def __init__(self, path: Path, content: bytes | None = None) -> None:
         self.path = path
         self._binary = b""
+        self.warnings: list[str] = []
         content = path.read_bytes() if content is None else content
         if content[:4] == _MAGIC:
             content = self._read_chunks(content)
-        self.document: JsonObject = json.loads(content.decode("utf-8-sig"))
+        self.document: JsonObject = json.loads(content.rstrip(b"\0").decode("utf-8-sig"))
         if not isinstance(self.document, dict) or not str(self._asset_version()).startswith("2."):
             raise ValueError(f"only version 2 of glTF can be read (got {self._asset_version()!r})")
         self.buffer = cache(self._read_buffer)
@@ -83,13 +85,22 @@ class GltfData:
             if index == 0 and self._binary:
                 return self._binary
             raise ValueError(f"buffer {index} has no data")
-        return self._content(uri, "buffer")
+        data = self._content(uri, "buffer")
+        stated = self.entry("buffers", index).get("byteLength", len(data))
+        if len(data) > stated + 3:  # padding
+            name = "" if uri.startswith("data:") else f" {uri}"
+            self.warnings.append(
+                f"its buffer{name} has {len(data)} bytes, but {stated} are stated: is it of another version of it?"
+            )
+        return data
 
     def _content(self, uri: str, kind: str) -> bytes:
         """Return the data of a URI: its own, or those of a file in the folder of the glTF file."""
         if uri.startswith("data:"):
             head, _, data = uri.partition(",")
-            return base64.b64decode(data) if head.endswith(";base64") else unquote_to_bytes(data)
+            if not head.lower().endswith(";base64"):
+                return unquote_to_bytes(data)
+            return base64.b64decode("".join(unquote(data).split()), validate=True)
         return find_reference(self.path, unquote_to_bytes(uri).decode(), kind).read_bytes()
 
     def view(self, index: object) -> memoryview:

@@ -61,8 +61,9 @@ class Quality:
             Gaussian takes its share of the colour from those that it occludes, as estimated from a few sums. Opacities,
             depths and instances stay those of the tile's order.
         sh_degree: Highest spherical-harmonic degree that is evaluated.
-        samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered). ``edges`` takes one ray, and 2
-            x 2 at borders between instances, see :mod:`mitsplat.renderer.instances.antialiasing`.
+        samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered), which share the light of the
+            pixel's centre. ``edges`` takes one ray. Every value except 1 takes rays with their own light at borders
+            between instances, see :mod:`mitsplat.renderer.instances.antialiasing`.
         lens_rings: Rings of sample points around the centre of a thin lens: 1, 2, 3 take 7, 19, 37 images. Wide blur
             shows single points, and more rings make it smooth.
     """
@@ -100,6 +101,12 @@ class Quality:
     def rays_per_axis(self) -> int:
         """Rays per pixel along each axis."""
         return 1 if self.samples == "edges" else self.samples
+
+    @property
+    def rays_at_borders(self) -> int:
+        """Rays per pixel along each axis at borders between instances: 1, 2 or 4, because blocks of them are tiles."""
+        rays = 2 if self.samples == "edges" else self.samples
+        return rays if rays <= 2 else 4
 
     @property
     def order(self) -> Order:

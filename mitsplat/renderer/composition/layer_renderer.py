@@ -141,7 +141,7 @@ class LayerRenderer:
             "order_error": None if splat.error is None else largest_and_mean(splat.error),
         }
         dr.eval(layers, shown.key)
-        if self.quality.samples == "edges":
+        if self.quality.rays_at_borders > 1:
             layers |= self._smooth_edges(contents, scene, view, layers, shown.key, radiance, white)
         return layers
 
@@ -179,7 +179,7 @@ class LayerRenderer:
         white: mi.Color3f,
     ) -> dict[str, mi.Float | mi.Color3f]:
         """Return colours and opacity with several rays averaged at borders between pixels of different ``key``."""
-        edges = Edges.find(key, view)
+        edges = Edges.find(key, view, self.quality.rays_at_borders)
         if edges is None:
             return {}
         rays = edges.rays()

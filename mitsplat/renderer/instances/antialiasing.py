@@ -1,6 +1,7 @@
-"""Antialiasing of silhouettes: at borders between instances, a pixel is the mean of ZOOM x ZOOM rays.
+"""Antialiasing of silhouettes: at borders between instances, a pixel is the mean of several rays with their own light.
 
-One ray through a pixel's centre sees only one side of a silhouette, so that its outline shows steps. Pixels with a
+One ray through a pixel's centre sees only one side of a silhouette, so that its outline shows steps. The mean of
+several rays times the light of the pixel's centre shows specks where both sides differ in light. Pixels with a
 neighbour of another instance or another visible mesh are therefore rendered again, in a view with one pixel per ray.
 Only the tiles of this view that contain such pixels have lists. The average is taken over linear, lit colours.
 
@@ -27,12 +28,6 @@ from mitsplat.renderer.splatting.march import Image, march_tiles
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.tiles import bin_gaussians
 
-ZOOM = 2
-"""Rays along each axis of a pixel, a divisor of a tile's width and height."""
-
-BLOCK_WIDTH, BLOCK_HEIGHT = TILE_WIDTH // ZOOM, TILE_HEIGHT // ZOOM
-"""Size of a block of pixels that are rendered again together [px]: one tile of the finer view."""
-
 
 @dataclass(frozen=True, eq=False)
 class Edges:
@@ -42,30 +37,38 @@ class Edges:
 
     Attributes:
         view: View of the picture.
-        fine: Finer view.
+        fine: Finer view, with one pixel per ray.
         subset: Tiles of the finer view that contain borders.
+        zoom: Rays along each axis of a pixel.
     """
 
     view: CameraView
     fine: CameraView
     subset: TileSubset
+    zoom: int
 
     @classmethod
-    def find(cls, key: mi.UInt32, view: CameraView) -> Edges | None:
+    def find(cls, key: mi.UInt32, view: CameraView, zoom: int) -> Edges | None:
         """Find the pixels whose ``key`` (UInt32, row-major) differs from one of their eight neighbours.
 
-        Returns None if there are none.
+        Args:
+            key: Keys of the pixels of the view.
+            view: View of the picture.
+            zoom: Rays along each axis of a pixel, a divisor of a tile's width and height.
+
+        Returns:
+            None if there are no such pixels.
         """
-        fine = view.finer(ZOOM)
+        fine, width, height = view.finer(zoom), TILE_WIDTH // zoom, TILE_HEIGHT // zoom
         block = dr.arange(mi.UInt32, fine.tiles_x * fine.tiles_y)
         row = block // fine.tiles_x
-        x, y = mi.Int32(block - row * fine.tiles_x) * BLOCK_WIDTH, mi.Int32(row) * BLOCK_HEIGHT
+        x, y = mi.Int32(block - row * fine.tiles_x) * width, mi.Int32(row) * height
         own, differs = dr.gather(mi.UInt32, key, _pixel(x, y, view)), mi.Bool(False)
-        for dx, dy in np.ndindex(BLOCK_WIDTH + 2, BLOCK_HEIGHT + 2):
+        for dx, dy in np.ndindex(width + 2, height + 2):
             differs |= dr.gather(mi.UInt32, key, _pixel(x + (dx - 1), y + (dy - 1), view)) != own
         dr.eval(differs)
         subset = TileSubset.of(differs, fine)
-        return cls(view, fine, subset) if subset.count else None
+        return cls(view, fine, subset, zoom) if subset.count else None
 
     def rays(self) -> mi.Ray3f:
         """Return the world-space rays of the finer view, with unit direction."""
@@ -99,7 +102,7 @@ class Edges:
     def pixels(self) -> mi.UInt32:
         """Return the pixel of the picture that contains each ray."""
         x, y = self._places()
-        return _pixel(mi.Int32(x // ZOOM), mi.Int32(y // ZOOM), self.view)
+        return _pixel(mi.Int32(x // self.zoom), mi.Int32(y // self.zoom), self.view)
 
     def nearest_other(self, keys: mi.UInt32, own: mi.UInt32) -> mi.UInt32:
         """Return for each ray the nearest pixel with another key than its own pixel; that pixel if there is none.
@@ -111,9 +114,9 @@ class Edges:
             own: Keys of the rays.
         """
         x, y = self._places()
-        px, py = mi.Int32(x // ZOOM), mi.Int32(y // ZOOM)
+        px, py = mi.Int32(x // self.zoom), mi.Int32(y // self.zoom)
         # Direction of the nearer neighbour along each axis.
-        right, down = (dr.select(place % ZOOM * 2 >= ZOOM, mi.Int32(1), -1) for place in (x, y))
+        right, down = (dr.select(place % self.zoom * 2 >= self.zoom, mi.Int32(1), -1) for place in (x, y))
         pixel = _pixel(px, py, self.view)
         here, found = dr.gather(mi.UInt32, keys, pixel), mi.Bool(False)
         for dx, dy in ((1, 0), (0, 1), (1, 1), (-1, 0), (0, -1), (-1, 1), (1, -1), (-1, -1)):
@@ -125,20 +128,20 @@ class Edges:
 
     def averaged(self, values: mi.Float | mi.Color3f, fine: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
         """Return the picture ``values`` (Float or Color3f) with means over the rays in the blocks with borders."""
-        size = BLOCK_WIDTH * BLOCK_HEIGHT
-        lane = dr.arange(mi.UInt32, self.subset.count * size)
-        tile, within = lane // size, lane % size
-        bx, by = within % BLOCK_WIDTH, within // BLOCK_WIDTH
+        width, height = TILE_WIDTH // self.zoom, TILE_HEIGHT // self.zoom
+        lane = dr.arange(mi.UInt32, self.subset.count * width * height)
+        tile, within = lane // (width * height), lane % (width * height)
+        bx, by = within % width, within // width
         total = type(fine)(0)
-        for dx, dy in np.ndindex(ZOOM, ZOOM):
-            place = tile * TILE_PIXELS + (by * ZOOM + dy) * TILE_WIDTH + bx * ZOOM + dx
+        for dx, dy in np.ndindex(self.zoom, self.zoom):
+            place = tile * TILE_PIXELS + (by * self.zoom + dy) * TILE_WIDTH + bx * self.zoom + dx
             total += dr.gather(type(fine), fine, place)
         number = dr.gather(mi.UInt32, self.subset.number, tile)
         row = number // self.fine.tiles_x
-        x, y = (number - row * self.fine.tiles_x) * BLOCK_WIDTH + bx, row * BLOCK_HEIGHT + by
+        x, y = (number - row * self.fine.tiles_x) * width + bx, row * height + by
         inside = (x < self.view.width) & (y < self.view.height)
         result = dr.copy(values)
-        dr.scatter(result, total / (ZOOM * ZOOM), y * self.view.width + x, inside, mode=dr.ReduceMode.Permute)
+        dr.scatter(result, total / self.zoom**2, y * self.view.width + x, inside, mode=dr.ReduceMode.Permute)
         return result
 
     def _places(self) -> tuple[mi.UInt32, mi.UInt32]:

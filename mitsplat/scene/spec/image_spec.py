@@ -238,8 +238,8 @@ class Rendering(StrictModel):
     )
     samples: Annotated[int, Field(ge=1, le=8)] | Literal["edges"] = Field(
         "edges",
-        description="Rays per pixel along each axis. ``edges`` takes one ray per pixel, and 2 x 2 rays where objects "
-        "border on each other.",
+        description="Rays per pixel along each axis. ``edges`` takes one ray per pixel. Where objects border on each "
+        "other, ``edges`` and 2 take 2 x 2 rays, and larger numbers 4 x 4.",
     )
     lens_rings: int = Field(
         2,

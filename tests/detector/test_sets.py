@@ -388,7 +388,7 @@ def test_the_split_all_of_coco_reads_all_files(tmp_path: Path) -> None:
         (root / f"{name}.json").write_text(json.dumps(content | {"images": images, "annotations": some}))
     assert [len(read_set(root, split).samples) for split in ("train", "val", "all")] == [3, 1, 4]  # type: ignore[arg-type]
     (root / "old_train.json").write_text((root / "instances_train2017.json").read_text())
-    with pytest.raises(InputError, match="each image must be in one of its COCO files"):
+    with pytest.raises(InputError, match="each image must be listed once in its COCO files"):
         read_set(root, "all")
 
 

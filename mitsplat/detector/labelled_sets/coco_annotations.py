@@ -16,6 +16,8 @@ from mitsplat.storage.files import JsonObject
 
 _BOX_TOLERANCE = 2.0
 """Largest difference of a box from the bounds of its segmentation at which both are the same [px]."""
+_MAX_BEYOND = 0.25
+"""Largest distance by which a segmentation leaves its box, as a share of the sides of the box."""
 
 
 def read_annotation(annotation: JsonObject, class_index: int, size: tuple[int, int], path: Path) -> LabelledObject:
@@ -60,6 +62,8 @@ def _read_segmentation(given: Any, size: tuple[int, int], place: str) -> JsonObj
     """
     width, height = size
     if isinstance(given, list):
+        if not all(isinstance(part, list) for part in given):
+            raise InputError(f"{place}: segmentation must be a list of polygons (got a list of numbers)")
         for part in given:
             if len(part) < 6 or len(part) % 2:
                 raise InputError(
@@ -100,8 +104,13 @@ def _check_box_of_mask(box: Float64Array, corners: Float64Array, rle: JsonObject
             f"{place}: bbox must be x, y, width, height, not {form} (got {got} for a segmentation that {span})"
         )
     (x0, y0), (x1, y1) = corners.tolist()
-    if min(x1, x + w) < max(x0, x) - 1 or min(y1, y + h) < max(y0, y) - 1:  # masks have whole pixels
-        raise InputError(f"{place}: bbox must enclose its segmentation, which {span} (got {got})")
+    beyond = max((x0 - x) / (x1 - x0), (x + w - x1) / (x1 - x0), (y0 - y) / (y1 - y0), (y + h - y1) / (y1 - y0))
+    outside = max(x0 - x, x + w - x1, y0 - y, y + h - y1)
+    if outside > _BOX_TOLERANCE and beyond > _MAX_BEYOND:
+        raise InputError(
+            f"{place}: bbox must enclose its segmentation, which {span} (got {got}): are run lengths stored by rows, "
+            "or is the box that of another object?"
+        )
 
 
 def _check_box_alone(annotation: JsonObject, box: Float64Array, place: str) -> None:
@@ -122,7 +131,9 @@ def _check_box_alone(annotation: JsonObject, box: Float64Array, place: str) -> N
 
 def is_fraction(box: object) -> bool:
     """Return True if a box has no value above 1."""
-    return isinstance(box, list) and all(isinstance(value, int | float) and value <= 1 for value in box)
+    return (
+        isinstance(box, list) and len(box) == 4 and all(isinstance(value, int | float) and value <= 1 for value in box)
+    )
 
 
 def _run_lengths(code: str) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -43,7 +44,7 @@ def read_coco(root: Path, split: Split, progress: Progress | None) -> LabelledSe
     samples = tuple(sample for part in parts for sample in part.samples)
     twice = [name for name, count in Counter(sample.name for sample in samples).items() if count > 1]
     if twice:
-        raise InputError(f"{root}: each image must be in one of its COCO files (got {twice[0]} in several)")
+        raise InputError(f"{root}: each image must be listed once in its COCO files (got {twice[0]} twice)")
     return replace(parts[0], samples=samples)
 
 
@@ -66,6 +67,8 @@ def _coco_part(root: Path, split: Split, path: Path, content: JsonObject, progre
         ):
             if double := [value for value, count in Counter(values).items() if count > 1]:
                 raise InputError(f"{path}: {what} must differ (got {double[0]!r} twice)")
+        if not all(name.strip() for name in names):
+            raise InputError(f"{path}: names of categories must be text (got {names})")
         for annotation in content["annotations"]:
             for key, known in (("image_id", by_image), ("category_id", index)):
                 if annotation[key] not in known:
@@ -143,7 +146,7 @@ def _image_finder(root: Path, listing: Path) -> Callable[[str], Path]:
     """Return a function that finds the images named in an annotation file."""
     below: dict[str, list[Path]] = {}
     for path in images_below(root):
-        below.setdefault(path.name, []).append(path)
+        below.setdefault(unicodedata.normalize("NFC", path.name), []).append(path)
 
     def find(name: str) -> Path:
         name = name.replace("\\", "/")  # as Label Studio writes it on Windows
@@ -152,7 +155,12 @@ def _image_finder(root: Path, listing: Path) -> Callable[[str], Path]:
         for folder in (listing.parent, root):
             if (folder / name).is_file():
                 return folder / name
-        found = [path for path in below.get(Path(name).name, ()) if f"/{path}".endswith(f"/{name}")]
+        plain = unicodedata.normalize("NFC", name)  # macOS writes letters and their accents apart
+        found = [
+            path
+            for path in below.get(Path(plain).name, ())
+            if unicodedata.normalize("NFC", f"/{path}").endswith(f"/{plain}")
+        ]
         if len(found) != 1:
             raise InputError(f"{listing}: {name} must be one image in {root} (got {len(found)})")
         return found[0]

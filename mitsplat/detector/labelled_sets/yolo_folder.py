@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -19,10 +21,12 @@ from mitsplat.detector.labelled_sets.labelled_set import (
     read_samples,
     relative_name,
 )
-from mitsplat.detector.labelled_sets.pictures import check_complete, images_below
+from mitsplat.detector.labelled_sets.pictures import SUFFIXES, check_complete, images_below
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.storage.files import SPLITS, JsonObject
+
+_logger = logging.getLogger(__name__)
 
 CLASSES_FILE = "classes.txt"
 """Class names in YOLO exports of Label Studio, one a line; all their images belong to every split."""
@@ -76,10 +80,13 @@ def _class_names(content: JsonObject, path: Path) -> tuple[str, ...]:
     names = content.get("names")
     if isinstance(names, dict) and names.keys() == set(range(len(names))):
         names = [names[i] for i in range(len(names))]
+    words = names if isinstance(names, list) else []
+    if wrong := [name for name in words if name is None or isinstance(name, list | dict) or not str(name).strip()]:
+        raise InputError(f"{path}: names must be text (got {wrong[0]!r:.80})")
     if not isinstance(names, list) or not names or len(set(map(str, names))) < len(names):
         raise InputError(f"{path}: names must be distinct classes, numbered from 0 (got {str(names)[:80]})")
     if content.get("nc", len(names)) != len(names):
-        raise InputError(f"{path}: nc must be the number of names, {len(names)} (got {content['nc']})")
+        raise InputError(f"{path}: nc must be the number of names, {len(names)} (got {content['nc']!r})")
     return tuple(map(str, names))
 
 
@@ -98,6 +105,7 @@ def _read_images(
     if not images:
         sought = ", ".join(str(root / entry) for name in wanted for entry in listed[name])
         raise InputError(f"{root}: there are no images for {split}" + (_split_counts(root, listed) or f" in {sought}"))
+    _check_label_files(images)
     if not any(_label_file(image).is_file() for image in images):
         raise InputError(f"{root}: its images have no labels, such as {_label_file(images[0])}")
 
@@ -118,6 +126,36 @@ def _read_images(
         return Sample(image, relative_name(root, image), width, height, instances, content.hexdigest())
 
     return LabelledSet(root, kind, split, classes, read_samples(read, images, root, progress))
+
+
+def _check_label_files(images: list[Path]) -> None:
+    """Log a warning if label files have no image.
+
+    Raises:
+        InputError: If the name of such a file is another spelling of the name of an image without labels.
+    """
+    for labels, pictures in dict.fromkeys((_label_file(image).parent, image.parent) for image in images):
+        if labels == pictures or not labels.is_dir():
+            continue
+        stems = {path.stem for path in pictures.iterdir() if path.suffix.lower() in SUFFIXES}
+        bare = {_plain(stem): stem for stem in stems if not (labels / f"{stem}.txt").is_file()}
+        texts = sorted(path for path in labels.iterdir() if path.suffix.lower() == ".txt" and path.name != CLASSES_FILE)
+        alone = [path for path in texts if path.stem not in stems or path.suffix != ".txt"]
+        for path in alone:
+            if stem := bare.get(_plain(path.stem)):
+                raise InputError(
+                    f"{path}: must be named as its image {stem} with .txt (got another letter case, or another Unicode "
+                    "form of its letters)"
+                )
+        if alone:
+            more = f" and {len(alone) - 1} more" if len(alone) > 1 else ""
+            _logger.warning(
+                "%s: %s%s are not used, because %s has no image of these names", labels, alone[0].name, more, pictures
+            )
+
+
+def _plain(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _split_entry(root: Path, base: str, entry: str) -> str:

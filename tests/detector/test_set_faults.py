@@ -1,0 +1,117 @@
+"""Labelled sets that most readers accept with wrong or missing labels."""
+
+from __future__ import annotations
+
+import json
+import unicodedata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mitsplat.detector.labelled_sets.set_reading import read_set
+from mitsplat.errors import InputError
+
+WIDTH, HEIGHT = 100, 80
+LINE = "0 0.5 0.5 0.2 0.25\n"
+NAME = unicodedata.normalize("NFC", "größe")
+
+
+def yolo(root: Path, images: tuple[str, ...], labels: tuple[str, ...], names: str = "[nut, bolt]") -> Path:
+    """Write a YOLO folder with one label in each label file."""
+    for folder in ("images/train", "labels/train"):
+        (root / folder).mkdir(parents=True)
+    (root / "data.yaml").write_text(f"train: images/train\nnames: {names}\n")
+    for name in images:
+        Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(root / "images/train" / name)
+    for name in labels:
+        (root / "labels/train" / name).write_text(LINE)
+    return root
+
+
+def coco(root: Path, annotation: dict[str, Any], **more: Any) -> Path:
+    """Write a COCO folder of one image with one annotation."""
+    root.mkdir(exist_ok=True)
+    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(root / f"{NAME}.png")
+    image = {"id": 1, "file_name": f"{NAME}.png", "width": WIDTH, "height": HEIGHT}
+    given = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [40, 30, 20, 10], **annotation}
+    categories = [{"id": 1, "name": "nut"}, {"id": 2, "name": "bolt"}]
+    content = {"images": [image], "annotations": [given], "categories": categories, **more}
+    (root / "train.json").write_text(json.dumps(content))
+    return root
+
+
+@pytest.mark.parametrize("label", [f"{unicodedata.normalize('NFD', NAME)}.txt", f"{NAME.upper()}.txt", f"{NAME}.TXT"])
+@pytest.mark.parametrize("others", [(), ("other",)])
+def test_labels_in_another_spelling_than_their_image_are_refused(
+    tmp_path: Path, label: str, others: tuple[str, ...]
+) -> None:
+    """The image counted as one without objects if other images had labels."""
+    images = (f"{NAME}.png", *(f"{name}.png" for name in others))
+    root = yolo(tmp_path / "a", images, (label, *(f"{name}.txt" for name in others)))
+    with pytest.raises(InputError, match=rf"must be named as its image {NAME} with \.txt \(got another letter case"):
+        read_set(root, "train")
+
+
+def test_labels_without_an_image_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    root = yolo(tmp_path / "a", ("a.png", "b.png"), ("a.txt", "c.txt", "d.txt"))
+    assert [len(sample.instances) for sample in read_set(root, "train").samples] == [1, 0]
+    folder = root / "labels/train"
+    assert caplog.messages == [
+        f"{folder}: c.txt and 1 more are not used, because {root / 'images/train'} has no image of these names"
+    ]
+    caplog.clear()
+    (root / "chosen.txt").write_text("images/train/a.png\n")
+    (root / "data.yaml").write_text("train: chosen.txt\nnames: [nut, bolt]\n")
+    for name in ("c.txt", "d.txt"):
+        (folder / name).unlink()
+    (folder / "b.txt").write_text(LINE)
+    assert len(read_set(root, "train").samples) == 1 and not caplog.messages
+
+
+@pytest.mark.parametrize(
+    ("names", "got"), [("[nut, null]", "None"), ("[[nut], bolt]", r"\['nut'\]"), ('["", bolt]', "''")]
+)
+def test_names_that_are_no_text_are_refused(tmp_path: Path, names: str, got: str) -> None:
+    root = yolo(tmp_path / "a", ("a.png",), ("a.txt",), names)
+    with pytest.raises(InputError, match=rf"data\.yaml: names must be text \(got {got}\)"):
+        read_set(root, "train")
+
+
+def run_lengths(mask: np.ndarray, order: Any) -> dict[str, Any]:
+    values = mask.ravel(order=order)
+    changes = np.flatnonzero(np.diff(values)) + 1
+    return {"size": [HEIGHT, WIDTH], "counts": np.diff([0, *changes, values.size]).tolist()}
+
+
+def test_run_lengths_that_are_stored_by_rows_are_refused(tmp_path: Path) -> None:
+    """The mask was spread over other pixels, which include those of the box."""
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[30:40, 40:60] = 1
+    (instance,) = read_set(coco(tmp_path, {"segmentation": run_lengths(mask, "F")}), "train").samples[0].instances
+    assert instance.box == (40, 30, 60, 40)
+    with pytest.raises(InputError, match=r"bbox must enclose its segmentation, .*: are run lengths stored by rows"):
+        read_set(coco(tmp_path, {"segmentation": run_lengths(mask, "C")}), "train")
+
+
+@pytest.mark.parametrize(
+    ("annotation", "more", "sentence"),
+    [
+        ({"bbox": []}, {}, r"annotation 1: bbox must be x, y, width, height \(got \[\]\)"),
+        ({"segmentation": [40, 30, 60, 30, 60, 40]}, {}, r"must be a list of polygons \(got a list of numbers\)"),
+        ({}, {"categories": [{"id": 1, "name": ""}]}, r"names of categories must be text"),
+        ({}, {"images": [{"id": k, "file_name": f"{NAME}.png"} for k in (1, 2)]}, r"must be listed once"),
+    ],
+)
+def test_faults_of_a_coco_file_are_one_sentence(
+    tmp_path: Path, annotation: dict[str, Any], more: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        read_set(coco(tmp_path, annotation, **more), "train")
+
+
+def test_images_are_found_in_the_unicode_form_of_macos(tmp_path: Path) -> None:
+    image = {"id": 1, "file_name": unicodedata.normalize("NFD", f"{NAME}.png")}
+    assert len(read_set(coco(tmp_path, {}, images=[image]), "train").samples) == 1

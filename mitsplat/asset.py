@@ -34,7 +34,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import check_faces
-from mitsplat.geometry.rigid import transform_points
+from mitsplat.geometry.rigid import homogeneous_matrix, transform_points
 from mitsplat.geometry.untrusted_meshes import check_mesh
 from mitsplat.mesh_files.mesh_file import MeshFrame
 from mitsplat.mesh_files.mesh_reading import SCENE_SUFFIXES, read_surface
@@ -220,8 +220,7 @@ class Asset:
             units="unknown" if spec.units == "unknown" and spec.size is None else "metre",
             folder=folder,
         )
-        metres_from_file = np.eye(4)
-        metres_from_file[:3, :3] = np.multiply(_Z_UP_FROM[spec.up], _metres_per_unit(spec, asset))
+        metres_from_file = homogeneous_matrix(np.multiply(_Z_UP_FROM[spec.up], _metres_per_unit(spec, asset)))
         return asset if np.array_equal(metres_from_file, np.eye(4)) else asset.transformed(metres_from_file)
 
     def save(self, folder: str | PathLike[str], *, splats: str = "splats.ply") -> None:

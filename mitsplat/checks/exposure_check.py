@@ -8,6 +8,7 @@ import numpy as np
 
 from mitsplat.findings import Finding
 from mitsplat.frames.frame import render_frame
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.images.colour import LUMINANCE
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.frame_plan import plan_frame
@@ -46,8 +47,8 @@ def _placed_objects(scene: Scene) -> Layout:
     for number, (entry, pool) in enumerate(zip(scene.spec.objects, scene.pools, strict=True)):
         region, _ = scene.spec.all_regions[scene.spec.regions_of(entry)[0]]
         share = (number + 0.5) / len(scene.pools)
-        pose = np.eye(4)
-        pose[:3, 3] = [*np.add(region.min[:2], share * np.subtract(region.max[:2], region.min[:2])), region.min[2]]
+        x, y = np.add(region.min[:2], share * np.subtract(region.max[:2], region.min[:2]))
+        pose = homogeneous_matrix(np.eye(3), (x, y, region.min[2]))
         absent = (len(entry.poses) or entry.count[0]) - 1
         poses.setdefault(pool[0], []).extend([pose, *[None] * absent])
     return Layout.from_poses(scene, poses)

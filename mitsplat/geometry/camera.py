@@ -26,7 +26,14 @@ from mitsplat.geometry.lens import (
     lens_fault,
     undistort,
 )
-from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, points_of, rigid_matrix, split_similarity, transform_points
+from mitsplat.geometry.rigid import (
+    OPENCV_FROM_OPENGL,
+    homogeneous_matrix,
+    points_of,
+    rigid_matrix,
+    split_similarity,
+    transform_points,
+)
 from mitsplat.storage.files import JsonObject
 
 MAX_IMAGE_SIDE = 16384
@@ -231,10 +238,7 @@ class Camera:
     def camera_from_world(self) -> Float64Array:
         """Extrinsics: rigid inverse of ``world_from_camera``, shape (4, 4)."""
         rotation, centre = self.world_from_camera[:3, :3], self.world_from_camera[:3, 3]
-        inverse = np.eye(4)
-        inverse[:3, :3] = rotation.T
-        inverse[:3, 3] = -rotation.T @ centre
-        return inverse
+        return homogeneous_matrix(rotation.T, -rotation.T @ centre)
 
     @property
     def centre(self) -> Float64Array:
@@ -268,9 +272,9 @@ class Camera:
             InputError: If the matrix shears, mirrors or scales unevenly.
         """
         rotation, scale, translation = split_similarity(matrix)
-        pose = np.eye(4)
-        pose[:3, :3] = rotation @ self.world_from_camera[:3, :3]
-        pose[:3, 3] = scale * rotation @ self.centre + translation
+        pose = homogeneous_matrix(
+            rotation @ self.world_from_camera[:3, :3], scale * rotation @ self.centre + translation
+        )
         return replace(self, world_from_camera=pose, near=self.near * scale)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
-from mitsplat.geometry.rigid import points_of
+from mitsplat.geometry.rigid import homogeneous_matrix, points_of
 
 
 def direction(azimuth: float, sine: float) -> Float64Array:
@@ -59,10 +59,7 @@ def look_at_pose(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = 
     if np.linalg.norm(right) <= 1e-6 * float(np.linalg.norm(upper)):
         right = _cross(forward, np.eye(3)[1 if abs(forward[1]) < 0.9 else 2])
     right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, _cross(forward, right), forward], axis=1)
-    pose[:3, 3] = start
-    return pose
+    return homogeneous_matrix(np.stack([right, _cross(forward, right), forward], axis=1), start)
 
 
 def _point(value: npt.ArrayLike, place: str) -> Float64Array:

@@ -88,15 +88,20 @@ def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float6
     return u @ vt, scale, values[:3, 3]
 
 
+def homogeneous_matrix(linear: npt.ArrayLike, translation: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Float64Array:
+    """Return the affine transform (4, 4) with a linear part (3, 3), such as a rotation, and a translation (3,)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, translation
+    return matrix
+
+
 def nearest_rigid(matrix: Float64Array) -> Float64Array:
     """Return the rigid transform (4, 4) with the rotation that is nearest to the given one.
 
     Source: Arun, Huang and Blostein, *Least-Squares Fitting of Two 3-D Point Sets*, 1987.
     """
     u, _, vt = np.linalg.svd(matrix[:3, :3])
-    nearest = np.eye(4)
-    nearest[:3, :3], nearest[:3, 3] = u @ vt, matrix[:3, 3]
-    return nearest
+    return homogeneous_matrix(u @ vt, matrix[:3, 3])
 
 
 def transform_points(matrix: Float64Array, points: npt.NDArray[np.floating]) -> Float64Array:

@@ -25,6 +25,7 @@ from mitsplat.gaussians.splat_files import Axis, default_up_axis
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.decomposition import convex_pieces
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.gltf_splats.splat_reading import is_gltf, read_gltf_splats
 from mitsplat.importing.upright import Plane, Upright, cut_support, find_up
 from mitsplat.progress import Progress
@@ -244,8 +245,7 @@ def import_splats(
     cleaner, upright = _clean(path, loaded, kind, settings, report)
     if reason:
         upright = replace(upright, reason=reason)
-    turn = np.eye(4)
-    turn[:3, :3] = upright.rotation
+    turn = homogeneous_matrix(upright.rotation)
     support = None
     if kind == "environment" and upright.support is not None:
         support, placed = _align_to_support(cleaner.splats.transformed(turn), upright.support)

@@ -30,6 +30,7 @@ from skimage.measure import find_contours
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.silhouette_refinement import Refinement, is_gain
@@ -209,10 +210,9 @@ class _PoseFrame:
 
     def motion(self, pose: Float64Array) -> Float64Array:
         """Return the transform (4, 4) of parameters; rotation and scale are about the centre."""
-        motion = np.eye(4)
-        motion[:3, :3] = np.exp(pose[6:].sum()) * Rotation.from_rotvec(pose[:3]).as_matrix()
-        motion[:3, 3] = self.middle + self.radius * pose[3:6] - motion[:3, :3] @ self.middle
-        whole: Float64Array = motion @ self.start
+        linear = np.exp(pose[6:].sum()) * Rotation.from_rotvec(pose[:3]).as_matrix()
+        translation = self.middle + self.radius * pose[3:6] - linear @ self.middle
+        whole: Float64Array = homogeneous_matrix(linear, translation) @ self.start
         return whole
 
 

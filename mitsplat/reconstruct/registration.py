@@ -22,7 +22,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
-from mitsplat.geometry.rigid import split_similarity, transform_points
+from mitsplat.geometry.rigid import homogeneous_matrix, split_similarity, transform_points
 from mitsplat.renderer.layers import render_splats
 
 _OPAQUE = 0.9
@@ -188,10 +188,8 @@ def _initial_poses(points: Float64Array, samples: Float64Array, scale: float | N
         turn = np.eye(3)[list(order)] * signs
         if np.linalg.det(turn) < 0:
             continue
-        start = np.eye(4)
-        start[:3, :3] = ratio * to_axes @ turn @ from_axes.T
-        start[:3, 3] = to_middle - start[:3, :3] @ from_middle
-        starts.append(start)
+        linear = ratio * to_axes @ turn @ from_axes.T
+        starts.append(homogeneous_matrix(linear, to_middle - linear @ from_middle))
     return starts
 
 
@@ -223,9 +221,7 @@ def _icp_steps(
         weighted = rows.T * weight
         update = np.linalg.pinv(weighted @ rows, rcond=1e-5, hermitian=True) @ (weighted @ wanted)
         turn = Rotation.from_rotvec(update[:3]).as_matrix() * (1 + float(np.clip(update[3], -0.1, 0.1)))
-        step = np.eye(4)
-        step[:3, :3], step[:3, 3] = turn, middle - turn @ middle + size * update[4:]
-        matrix = step @ matrix
+        matrix = homogeneous_matrix(turn, middle - turn @ middle + size * update[4:]) @ matrix
         if width == widths[-1] and np.abs(update).max() < 1e-6:
             break
     return matrix

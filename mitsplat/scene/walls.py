@@ -10,6 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.scene.spec.object_spec import ObjectPose
 from mitsplat.scene.spec.scene_spec import BACKDROP, SceneSpec
 from mitsplat.scene.spec.shape_spec import Backdrop, Bin, Box, Enclosure, Region, Shape
@@ -148,10 +149,7 @@ def material_name(shape: str) -> str:
 
 def pose_matrix(place: Box | ObjectPose) -> Float64Array:
     """Return a pose of the scene file as a transform (4, 4)."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("xyz", place.rotate, degrees=True).as_matrix()
-    pose[:3, 3] = place.position
-    return pose
+    return homogeneous_matrix(Rotation.from_euler("xyz", place.rotate, degrees=True).as_matrix(), place.position)
 
 
 def bin_walls(shape: Bin) -> tuple[trimesh.Trimesh, ...]:

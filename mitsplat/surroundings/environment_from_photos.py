@@ -19,6 +19,7 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.fit.image_metrics import psnr
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.geometry.triangulation import nearest_point_to_lines
 from mitsplat.pages.html import make_section, rgb_image
 from mitsplat.progress import Progress
@@ -223,8 +224,7 @@ def _without_rotation(made: Reconstruction, motion: Float64Array) -> tuple[Recon
         The reconstruction, and the scaling (4, 4) from the frame of the support to that of the asset.
     """
     factor = float(np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3])))
-    back = np.eye(4)
-    back[:3, :3] = made.asset_from_capture[:3, :3].T / factor
+    back = homogeneous_matrix(made.asset_from_capture[:3, :3].T / factor)
     larger = np.diag([factor, factor, factor, 1.0])
     return replace(made, asset=made.asset.transformed(back), asset_from_capture=larger @ motion), larger
 

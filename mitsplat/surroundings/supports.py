@@ -17,7 +17,7 @@ from scipy.ndimage import binary_closing, binary_opening, label
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.geometry.camera_poses import direction
-from mitsplat.geometry.rigid import split_similarity, transform_points
+from mitsplat.geometry.rigid import homogeneous_matrix, split_similarity, transform_points
 from mitsplat.importing.upright import POINTS, largest_plane, rotation_to_z
 from mitsplat.surroundings.depth_views import SurfacePoints
 
@@ -90,9 +90,7 @@ class Support:
     def transformed(self, motion: Float64Array) -> Support:
         """Return the support after a similarity transform (4, 4)."""
         rotation, scale, translation = split_similarity(motion)
-        pose = np.eye(4)
-        pose[:3, :3] = rotation @ self.pose[:3, :3]
-        pose[:3, 3] = scale * rotation @ self.pose[:3, 3] + translation
+        pose = homogeneous_matrix(rotation @ self.pose[:3, :3], scale * rotation @ self.pose[:3, 3] + translation)
         return Support(
             pose,
             (scale * self.size[0], scale * self.size[1]),
@@ -204,8 +202,7 @@ def _plane_parts(
     scale: float,
 ) -> list[Support]:
     """Return the connected parts of a plane that are large enough."""
-    turn = np.eye(4)
-    turn[:3, :3] = rotation_to_z(normal)
+    turn = homogeneous_matrix(rotation_to_z(normal))
     flat = (places @ turn[:3, :3].T)[:, :2]
     cell = _CELL * scale
     low = flat.min(axis=0) - 4 * cell

@@ -26,6 +26,7 @@ from mitsplat.arguments import check_type
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.scene.given_poses import asset_index
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.scene import Scene
@@ -148,8 +149,7 @@ def camera_from_mujoco(
     if not data.cam_xmat[number].any():
         raise InputError(f"camera {name!r}: has no pose yet; call mujoco.mj_forward(model, data) first")
     width, height = stated[0] if width is None else width, stated[1] if height is None else height
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = data.cam_xmat[number].reshape(3, 3), data.cam_xpos[number]
+    pose = homogeneous_matrix(data.cam_xmat[number].reshape(3, 3), data.cam_xpos[number])
     if model.cam_sensorsize[number].all():
         # Lengths in the plane of the sensor [m]; the offset of the window has y up.
         per_metre = np.array([width, height]) / model.cam_sensorsize[number]

@@ -25,7 +25,7 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
+from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, homogeneous_matrix
 from mitsplat.images.colour import temperature_colour
 from mitsplat.physics.bodies import make_body
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION, ContactMaterial
@@ -354,8 +354,7 @@ class _StageWriter:
             return
         if light.temperature is not None:
             colour = colour * temperature_colour(light.temperature)
-        pose = np.eye(4)
-        pose[:3, 3] = light.position
+        pose = homogeneous_matrix(np.eye(3), light.position)
         if light.kind == "area":
             rect = UsdLux.RectLight.Define(self.stage, path)
             rect.CreateWidthAttr(light.size[0])

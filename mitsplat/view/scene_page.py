@@ -18,6 +18,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.frames.layer_sheet import LAYERS, LayerName, draw_layer
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.physics.settle import replay_layout
 from mitsplat.quality import PRESETS, PresetName
 from mitsplat.scene.layout import Layout
@@ -180,9 +181,7 @@ class ScenePage:
     def _moved(self, camera: viser.CameraHandle) -> None:
         """Handle a moved view of a browser; it is a manual move unless the view equals the camera of the frame."""
         with self._lock:
-            pose = np.eye(4)
-            pose[:3, :3] = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
-            pose[:3, 3] = camera.position
+            pose = homogeneous_matrix(Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix(), camera.position)
             ours = [np.allclose(pose, own, atol=1e-4) for own in self._page_poses]
             if any(ours):  # moved by the page; browsers may report positions on the way
                 if ours[-1] and self._pose is not None:

@@ -22,7 +22,7 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.camera_poses import look_at_pose
-from mitsplat.geometry.rigid import transform_points
+from mitsplat.geometry.rigid import homogeneous_matrix, transform_points
 from mitsplat.labels.overlay import class_colour
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import layout_at_view
@@ -263,9 +263,8 @@ def light_parts(lights: Sequence[LightSpec], scene: Scene | None = None) -> Iter
         if isinstance(light, EnvironmentLight):
             continue
         if not isinstance(light, AreaLight | SpotLight):
-            yield ShownPart(
-                f"/lights/{number}", ShownMesh(trimesh.creation.icosphere(2, 0.02), _LIGHT), _moved(light.position)
-            )
+            ball = ShownMesh(trimesh.creation.icosphere(2, 0.02), _LIGHT)
+            yield ShownPart(f"/lights/{number}", ball, homogeneous_matrix(np.eye(3), light.position))
             continue
         pose = look_at_pose(light.position, light.target)
         if isinstance(light, AreaLight):
@@ -330,12 +329,6 @@ def _corners(low: npt.ArrayLike, high: npt.ArrayLike) -> Float64Array:
 def _box_edges(region: Region) -> Float64Array:
     edges: Float64Array = _corners(region.min, region.max)[_EDGES]
     return edges
-
-
-def _moved(position: npt.ArrayLike) -> Float64Array:
-    pose = np.eye(4)
-    pose[:3, 3] = position
-    return pose
 
 
 def _rectangle(width: float, height: float) -> trimesh.Trimesh:

@@ -15,7 +15,7 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.rigid import split_similarity
+from mitsplat.geometry.rigid import homogeneous_matrix, split_similarity, transform_points
 from mitsplat.reconstruct.registration import invert_transform
 from mitsplat.surroundings.supports import Support
 
@@ -106,3 +106,10 @@ def test_a_moved_camera_and_moved_points_keep_their_pixels(tmp_path: Path) -> No
         np.testing.assert_allclose(after, before, atol=tolerance)
         np.testing.assert_allclose(moved_depth, 0.4 * depth, rtol=1e-6)
         assert moved.photos[0].camera.near == pytest.approx(0.4 * CAMERA.near)
+
+
+def test_a_homogeneous_matrix_maps_points_by_its_linear_part_and_translation() -> None:
+    rng = np.random.default_rng(0)
+    linear, translation, points = rng.normal(size=(3, 3)), rng.normal(size=3), rng.normal(size=(5, 3))
+    expected = np.einsum("ij,nj->ni", linear, points) + translation
+    np.testing.assert_allclose(transform_points(homogeneous_matrix(linear, translation), points), expected)

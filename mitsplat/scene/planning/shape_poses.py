@@ -10,6 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.streams import random_stream
@@ -47,13 +48,12 @@ def draw_shift(shape: Shape, seed: int, layout: int) -> tuple[float, float, floa
 
 def shape_motion(shape: Shape, mesh: trimesh.Trimesh, seed: int, layout: int) -> Float64Array:
     """Return the transform (4, 4) of a shape from its place in the scene file to that in a layout."""
-    motion = np.eye(4)
-    if shape.is_jittered:
-        x, y, turn = draw_shift(shape, seed, layout)
-        middle = mesh.bounds.mean(axis=0)
-        motion[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix()
-        motion[:3, 3] = middle + np.array([x, y, 0.0]) - motion[:3, :3] @ middle
-    return motion
+    if not shape.is_jittered:
+        return np.eye(4)
+    x, y, angle = draw_shift(shape, seed, layout)
+    middle = mesh.bounds.mean(axis=0)
+    turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    return homogeneous_matrix(turn, middle + np.array([x, y, 0.0]) - turn @ middle)
 
 
 @lru_cache(maxsize=2)

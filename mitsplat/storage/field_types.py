@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 else:
     ModelMetaclass = type(BaseModel)
 
+Number = TypeVar("Number", bound=float)
 Vector = TypeVar("Vector", bound=tuple[float, ...])
 
 
@@ -97,21 +98,23 @@ def _check_not_black(colour: tuple[float, float, float]) -> tuple[float, float, 
     return colour
 
 
+Ordered = Annotated[tuple[Number, Number], AfterValidator(check_order)]
+"""Range ``[low, high]`` of a type of numbers, such as ``Ordered[Kelvin]``."""
+
 Vec3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 Unit = Annotated[float, Field(ge=0, le=1)]
-UnitRange = Annotated[tuple[Unit, Unit], AfterValidator(check_order)]
-Range = Annotated[tuple[float, float], AfterValidator(check_order)]
+UnitRange = Ordered[Unit]
+Range = Ordered[float]
 Stops = Annotated[float, Field(ge=-20, le=20)]
-StopsRange = Annotated[tuple[Stops, Stops], AfterValidator(check_order)]
-Blur = Annotated[float, Field(ge=0, le=1000)]
-BlurRange = Annotated[tuple[Blur, Blur], AfterValidator(check_order)]
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(check_order)]
+StopsRange = Ordered[Stops]
+BlurRange = Ordered[Annotated[float, Field(ge=0, le=1000)]]
+PositiveRange = Ordered[Positive]
 Vec3Range = Annotated[tuple[Vec3, Vec3], AfterValidator(_check_order_of_components)]
 SizeRange = Annotated[
     tuple[tuple[Positive, Positive], tuple[Positive, Positive]], AfterValidator(_check_order_of_components)
 ]
-NonNegativeRange = Annotated[tuple[NonNegativeFloat, NonNegativeFloat], AfterValidator(check_order)]
+NonNegativeRange = Ordered[NonNegativeFloat]
 CountRange = Annotated[
     tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]],
     AfterValidator(check_order),
@@ -121,11 +124,10 @@ Scale = Annotated[
     Positive | tuple[Positive, Positive],
     BeforeValidator(_scale_range, json_schema_input_type=Positive | tuple[Positive, Positive]),
 ]
-Elevation = Annotated[float, Field(ge=-90, le=90)]
-ElevationRange = Annotated[tuple[Elevation, Elevation], AfterValidator(check_order)]
+ElevationRange = Ordered[Annotated[float, Field(ge=-90, le=90)]]
 Kelvin = Annotated[float, Field(ge=1667, le=25000)]
-KelvinRange = Annotated[tuple[Kelvin, Kelvin], AfterValidator(check_order)]
-JpegQuality = Annotated[float, Field(ge=1, le=100)]
+KelvinRange = Ordered[Kelvin]
+JpegRange = Ordered[Annotated[float, Field(ge=1, le=100)]]
 EmittedColour = Annotated[
     tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat],
     AfterValidator(_check_not_black),

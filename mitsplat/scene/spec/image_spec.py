@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, model_validator
+from pydantic import BeforeValidator, Field, NonNegativeFloat, model_validator
 
 from mitsplat.quality import KernelName, ResponseName
 from mitsplat.storage.field_types import (
     BlurRange,
-    JpegQuality,
+    JpegRange,
     Kelvin,
+    KelvinRange,
     NonNegativeRange,
     Positive,
     PositiveRange,
@@ -20,7 +21,6 @@ from mitsplat.storage.field_types import (
     StopsRange,
     StrictModel,
     Unit,
-    check_order,
     optional_field,
 )
 from mitsplat.storage.yaml_input import FieldError
@@ -51,7 +51,7 @@ class Randomise(StrictModel):
         description="Angle of the hue axis of ``chroma_stretch`` from red towards green [degrees]. At 0, blue moves "
         "towards cyan and orange towards red.",
     )
-    white_balance: Annotated[tuple[Kelvin, Kelvin], AfterValidator(check_order)] = Field(
+    white_balance: KelvinRange = Field(
         (DAYLIGHT, DAYLIGHT),
         description="Colour temperature that appears white [K]. With ``composite.white_balance: auto`` it is the error "
         "of the automatic white balance: light that would be neutral has the colour that light of 6504 K has under "
@@ -79,7 +79,7 @@ class Randomise(StrictModel):
         description="Strength of an unsharp mask: factor on the difference between the picture and its Gaussian blur "
         "of 1 px. It also amplifies noise.",
     )
-    jpeg: Annotated[tuple[JpegQuality, JpegQuality], AfterValidator(check_order)] | None = Field(
+    jpeg: JpegRange | None = Field(
         None, description="JPEG quality of a compression before the image is written. No compression if absent."
     )
 

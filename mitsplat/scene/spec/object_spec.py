@@ -5,40 +5,30 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from mitsplat.storage.field_types import (
     CountRange,
     Name,
+    Ordered,
     Positive,
     Scale,
     StrictModel,
     Unit,
     UnitRange,
     Vec3,
-    check_order,
     optional_field,
 )
 from mitsplat.storage.yaml_input import FieldError
 
-_Hue = Annotated[float, Field(ge=-180, le=180)]
-HueRange = Annotated[tuple[_Hue, _Hue], AfterValidator(check_order)]
-_Saturation = Annotated[float, Field(ge=0, le=2)]
-SaturationRange = Annotated[tuple[_Saturation, _Saturation], AfterValidator(check_order)]
-_Value = Annotated[float, Field(ge=0.1, le=4)]
-ValueRange = Annotated[tuple[_Value, _Value], AfterValidator(check_order)]
-_Gain = Annotated[float, Field(ge=0.5, le=2)]
-GainRange = Annotated[tuple[_Gain, _Gain], AfterValidator(check_order)]
-_Roughness = Annotated[float, Field(ge=0.02, le=1)]
-RoughnessRange = Annotated[tuple[_Roughness, _Roughness], AfterValidator(check_order)]
-
-_Yaw = Annotated[float, Field(ge=-360, le=360)]
-YawRange = Annotated[tuple[_Yaw, _Yaw], AfterValidator(check_order)]
-
-_Speed = Annotated[float, Field(gt=0, le=3)]
-SpeedRange = Annotated[tuple[_Speed, _Speed], AfterValidator(check_order)]
-_Spin = Annotated[float, Field(ge=0, le=3600)]
-SpinRange = Annotated[tuple[_Spin, _Spin], AfterValidator(check_order)]
+HueRange = Ordered[Annotated[float, Field(ge=-180, le=180)]]
+SaturationRange = Ordered[Annotated[float, Field(ge=0, le=2)]]
+ValueRange = Ordered[Annotated[float, Field(ge=0.1, le=4)]]
+GainRange = Ordered[Annotated[float, Field(ge=0.5, le=2)]]
+RoughnessRange = Ordered[Annotated[float, Field(ge=0.02, le=1)]]
+YawRange = Ordered[Annotated[float, Field(ge=-360, le=360)]]
+SpeedRange = Ordered[Annotated[float, Field(gt=0, le=3)]]
+SpinRange = Ordered[Annotated[float, Field(ge=0, le=3600)]]
 USUAL_SPEED, USUAL_SPIN = (0.2, 0.6), (0.0, 720.0)
 
 Arrangement = Literal[

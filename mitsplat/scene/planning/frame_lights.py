@@ -6,12 +6,10 @@ Every value has a random stream of its own, named by the entry of the light, the
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from mitsplat.geometry.camera_poses import direction
-from mitsplat.scene.spec.light_spec import EnvironmentLight, LightDraw, LightSpec, RoomLight
+from mitsplat.scene.spec.light_spec import AimedLight, EnvironmentLight, LightDraw, LightSpec, RoomLight
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.streams import random_stream, weighted_choice
 
@@ -59,21 +57,25 @@ def _with_image(sky: EnvironmentLight, rng: np.random.Generator) -> EnvironmentL
 def _draw_values(light: LightSpec, draw: LightDraw, seed: int, name: str, number: int) -> LightSpec:
     """Return a light with values drawn from its ranges."""
 
-    def uniform(key: str, low: float | tuple[float, ...], high: float | tuple[float, ...]) -> Any:
-        value = random_stream(seed, f"light {name} {key}", number).uniform(low, high)
-        return tuple(value.tolist()) if isinstance(value, np.ndarray) else float(value)
+    def stream(key: str) -> np.random.Generator:
+        return random_stream(seed, f"light {name} {key}", number)
+
+    def uniform(key: str, low: float, high: float) -> float:
+        return float(stream(key).uniform(low, high))
 
     state: dict[str, object] = {"draw": None}
     for key in _UNIFORM:
         if (bounds := getattr(draw, key)) is not None:
-            state[key] = uniform(key, *bounds)
+            value = np.asarray(stream(key).uniform(*bounds)).tolist()
+            state[key] = tuple(value) if isinstance(value, list) else value
     if draw.temperature is not None:
-        state["temperature"] = 1.0 / uniform("temperature", *(1.0 / kelvin for kelvin in reversed(draw.temperature)))
+        low, high = draw.temperature
+        state["temperature"] = 1.0 / uniform("temperature", 1.0 / high, 1.0 / low)
     if draw.colour is not None:
         one, other = np.array(draw.colour)
         state["colour"] = tuple((one + uniform("colour", 0.0, 1.0) * (other - one)).tolist())
     if draw.distance is not None:
-        target: Any = getattr(light, "target", (0.0, 0.0, 0.0))
+        target = light.target if isinstance(light, AimedLight) else (0.0, 0.0, 0.0)
         azimuth = np.radians(uniform("azimuth", *draw.azimuth))
         # Uniform by area on the sphere: the sine of the elevation is uniform (Archimedes).
         sine = uniform("elevation", *np.sin(np.radians(draw.elevation)))

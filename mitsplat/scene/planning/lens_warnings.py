@@ -66,8 +66,7 @@ def _aspect_warnings(lens: Intrinsics, output: tuple[int, int]) -> Iterator[tupl
 
 
 def _principal_point_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tuple[str, str]]:
-    width, height = full
-    cx, cy = (middle / 2 if value is None else value for value, middle in ((lens.cx, width), (lens.cy, height)))
+    (width, height), (cx, cy) = full, lens.principal_point(full)
     if abs(cx / width - 0.5) <= CENTRE and abs(cy / height - 0.5) <= CENTRE:
         return
     outside = not (0 <= cx <= width and 0 <= cy <= height)
@@ -90,22 +89,19 @@ def _principal_point_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterat
 
 
 def _focal_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tuple[str, str]]:
-    if lens.fov_x is not None:
-        fov = lens.fov_x
-        if fov < FOV[0]:
-            yield f"fov_x is {fov:g} degrees", f"is it in radians? Then it is {np.degrees(fov):.3g} degrees"
-    else:
-        fx, fy = lens.fx or 1.0, lens.fy or lens.fx or 1.0
-        fov = float(np.degrees(2 * np.arctan(full[0] / (2 * fx))))
-        if fov < FOV[0]:
-            cause = "is fx of a larger image? Then state its size; a pixel is not a micrometre"
-            yield f"fx = {fx:g} px is a field of view of {fov:.3g} degrees in an image of {full[0]} px", cause
-        if max(fx / fy, fy / fx) > MAX_OBLONG:
-            ratio = f"fx = {fx:g} and fy = {fy:g} differ by a factor of {max(fx / fy, fy / fx):.3g}"
-            cause = (
-                "is one of them of another image size, or is fy a value of cx or cy? Most cameras have square pixels"
-            )
-            yield ratio, cause
+    fx, fy = lens.focal_lengths(full)
+    fov = lens.fov_x or float(np.degrees(2 * np.arctan(full[0] / (2 * fx))))
+    if fov < FOV[0] and lens.fov_x is not None:
+        yield f"fov_x is {fov:g} degrees", f"is it in radians? Then it is {np.degrees(fov):.3g} degrees"
+    elif fov < FOV[0]:
+        cause = "is fx of a larger image? Then state its size; a pixel is not a micrometre"
+        yield f"fx = {fx:g} px is a field of view of {fov:.3g} degrees in an image of {full[0]} px", cause
+    if max(fx / fy, fy / fx) > MAX_OBLONG:
+        ratio = f"fx = {fx:g} and fy = {fy:g} differ by a factor of {max(fx / fy, fy / fx):.3g}"
+        yield (
+            ratio,
+            "is one of them of another image size, or is fy a value of cx or cy? Most cameras have square pixels",
+        )
     if lens.lens == "opencv" and fov > FOV[1]:
         yield f"the field of view is {fov:.4g} degrees", "does the camera have a fisheye lens? Then state lens: fisheye"
 
@@ -113,10 +109,8 @@ def _focal_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tuple[s
 def _distortion_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tuple[str, str]]:
     if lens.is_pinhole:
         return
-    width, height = full
-    fx = lens.fx or width / (2 * np.tan(np.radians(lens.fov_x or 60) / 2))
-    centre = width / 2 if lens.cx is None else lens.cx, height / 2 if lens.cy is None else lens.cy
-    corners = (np.array([[0, 0], [width, 0], [0, height], [width, height]]) - centre) / (fx, lens.fy or fx)
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * full
+    corners = (corners - lens.principal_point(full)) / lens.focal_lengths(full)
     slopes = np.linalg.norm(undistort(corners, lens.distortion, lens.lens), axis=1)
     shown = np.maximum(np.linalg.norm(corners, axis=1), 1e-9)
     # A fisheye is compared with the equidistant lens.

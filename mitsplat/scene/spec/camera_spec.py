@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, model_validator
@@ -95,6 +95,18 @@ class Intrinsics(StrictModel):
         """True if the lens does not distort."""
         return is_pinhole(self.distortion, self.lens)
 
+    def focal_lengths(self, size: tuple[int, int]) -> tuple[float, float]:
+        """Return fx and fy [px] of images of a width and height [px]."""
+        if self.fov_x is not None:
+            fx = 0.5 * size[0] / float(np.tan(0.5 * np.radians(self.fov_x)))
+            return fx, fx
+        fx = cast(float, self.fx)
+        return fx, self.fy or fx
+
+    def principal_point(self, size: tuple[int, int]) -> tuple[float, float]:
+        """Return cx and cy [px] of images of a width and height [px], with the centre of the first pixel at 0.5."""
+        return size[0] / 2 if self.cx is None else self.cx, size[1] / 2 if self.cy is None else self.cy
+
 
 class Motion(StrictModel):
     """Exposure, in which a conveyor's belt and the objects on it move."""
@@ -111,6 +123,14 @@ class CameraKeys(StrictModel):
     )
 
 
+def _check_directions(eye: Vec3 | None, target: Vec3 | None, up: Vec3) -> None:
+    """Refuse points and a direction from which no pose follows."""
+    if not any(up):
+        raise FieldError("up", "must not be zero (got [0, 0, 0])")
+    if eye == target:
+        raise FieldError("target", f"must differ from eye (got {list(target or ())})")
+
+
 class PoseKey(StrictModel):
     """Key pose of a camera path."""
 
@@ -120,10 +140,7 @@ class PoseKey(StrictModel):
 
     @model_validator(mode="after")
     def _check(self) -> PoseKey:
-        if not any(self.up):
-            raise FieldError("up", "must not be zero (got [0, 0, 0])")
-        if self.eye == self.target:
-            raise FieldError("target", f"must differ from eye (got {list(self.target)})")
+        _check_directions(self.eye, self.target, self.up)
         return self
 
 
@@ -210,10 +227,7 @@ class CameraFixed(CameraKeys):
         for key in ("eye", "target"):
             if getattr(self, key) is None:
                 raise FieldError((), f"must have either world_from_camera, or eye and target (got no {key})")
-        if not any(self.up):
-            raise FieldError("up", "must not be zero (got [0, 0, 0])")
-        if self.eye == self.target:
-            raise FieldError("target", f"must differ from eye (got {list(self.eye or ())})")
+        _check_directions(self.eye, self.target, self.up)
         return self
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -232,29 +232,26 @@ class RoomLight(StrictModel):
 
     def expand(self) -> tuple[AreaLight, AreaLight, EnvironmentLight]:
         """Return the three entries that the room expands to: window, lamps and walls."""
-
-        def place(elevation: tuple[float, float]) -> dict[str, Any]:
-            return {"distance": (0.35 * self.size, 0.6 * self.size), "elevation": elevation}
-
-        def sizes(*shares: tuple[float, float]) -> Any:
-            return tuple((width * self.size, height * self.size) for width, height in shares)
-
+        width = self.size
+        distance = 0.35 * width, 0.6 * width
         window = LightDraw(
-            **place((12.0, 35.0)),
-            size=sizes((0.2, 0.25), (0.45, 0.4)),
+            distance=distance,
+            elevation=(12.0, 35.0),
+            size=((0.2 * width, 0.25 * width), (0.45 * width, 0.4 * width)),
             radiance=(3.0, 10.0),
             temperature=(5000.0, 8000.0),
         )
-        lamp = LightDraw(
-            **place((50.0, 85.0)),
+        lamps = LightDraw(
             count=(1, 3),
-            size=sizes((0.05, 0.05), (0.15, 0.35)),
+            distance=distance,
+            elevation=(50.0, 85.0),
+            size=((0.05 * width, 0.05 * width), (0.15 * width, 0.35 * width)),
             radiance=(8.0, 30.0),
             temperature=(2700.0, 5000.0),
         )
         walls = LightDraw(radiance=(0.1, 0.4), colour=((1.0, 1.0, 1.0), (1.0, 0.9, 0.78)))
-        area = [AreaLight(target=self.around, draw=draw) for draw in (window, lamp)]
-        return area[0], area[1], EnvironmentLight(draw=walls)
+        target = self.around
+        return AreaLight(target=target, draw=window), AreaLight(target=target, draw=lamps), EnvironmentLight(draw=walls)
 
 
 LightSpec = AreaLight | SpotLight | PointLight | EnvironmentLight

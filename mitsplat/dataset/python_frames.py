@@ -69,7 +69,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
                 raise InputError(
                     f"frame {index}: must be of the scene's {output.width}x{output.height} px (got {width}x{height})"
                 )
-            split = split_of(index, output.validation, output.test)
+            split = split_of(index, output)
             # The camera's pose and lens contain all drawn values except the motion.
             motion = {name: value for name, value in frame.plan.viewpoint.items() if name == "motion"}
             is_film = following is not None and _leads_to(frame, following)

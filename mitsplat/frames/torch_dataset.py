@@ -73,7 +73,7 @@ class FrameStream(IterableDataset[Sample]):
         worker = get_worker_info()
         first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
         output = self.scene.spec.output
-        training = (k for k in itertools.count() if split_of(k, output.validation, output.test) == "train")
+        training = (k for k in itertools.count() if split_of(k, output) == "train")
         layouts = itertools.islice(training, first, None, step)
         indices = (layout * output.views + view for layout in layouts for view in range(output.views))
         for frame in render_frames(self.scene, indices, quality=self.quality, progress=False):

@@ -8,24 +8,25 @@ from typing import Literal
 
 import numpy as np
 
-from mitsplat.scene.spec.scene_spec import SceneSpec
+from mitsplat.scene.spec.scene_spec import Output, SceneSpec
 from mitsplat.scene.streams import random_stream, weighted_choice
 
 Split = Literal["train", "val", "test"]
 
 
-def split_of(layout: int, validation: float, test: float = 0.0) -> Split:
-    """Return the split of a layout. It does not depend on the number of layouts.
+def split_of(layout: int, output: Output) -> Split:
+    """Return the split of a layout by ``output.validation`` and ``output.test``, but not by the number of layouts.
 
     The second layout is the first of the smaller split. Of n layouts, floor(1 + (n - 2) share) belong to the smaller of
     two splits. With a test split, layouts are first divided into test and others; then the others are divided into
     training and validation by the same rule.
     """
-    return _place_in_split(layout, validation, test)[0]
+    return _place_in_split(layout, output)[0]
 
 
-def _place_in_split(layout: int, validation: float, test: float) -> tuple[Split, int]:
+def _place_in_split(layout: int, output: Output) -> tuple[Split, int]:
     """Return the split of a layout, and the number of earlier layouts in it."""
+    validation, test = output.validation, output.test
     if test:
         in_part, layout = _divide(layout, test)
         if in_part:
@@ -54,7 +55,7 @@ def is_empty(spec: SceneSpec, layout: int) -> bool:
     """Return True if a layout has no labelled objects. Such layouts are evenly spread over each split."""
     if not spec.empty:
         return False
-    split, rank = _place_in_split(layout, spec.output.validation, spec.output.test)
+    split, rank = _place_in_split(layout, spec.output)
     phase = _phase(spec.seed, split)
     return math.floor((rank + 1) * spec.empty + phase) > math.floor(rank * spec.empty + phase)
 
@@ -64,7 +65,7 @@ def draw_environment(spec: SceneSpec, layout: int) -> int:
     if not isinstance(spec.environment, tuple) or len(spec.environment) == 1:
         return 0
     weights = np.ones(len(spec.environment))
-    if spec.hold_out.environments and split_of(layout, spec.output.validation, spec.output.test) != "test":
+    if spec.hold_out.environments and split_of(layout, spec.output) != "test":
         weights = weights * [name not in spec.hold_out.environments for name in spec.environment]
     return weighted_choice(random_stream(spec.seed, "environment", layout), weights)[0]
 

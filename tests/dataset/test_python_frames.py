@@ -103,7 +103,7 @@ def test_the_flow_of_a_film_is_written_and_audited(scene: Scene, frames: list, t
     aside = Camera.look_at((0.02, -0.05, 0.5), (0, 0, 0), width=64, height=48, fov_x=40)
     (other,) = render_frames(scene, layouts=[frames[0].layout], cameras=aside, quality="fast", progress=False)
     out = write_frames(scene, tmp_path / "out", [*frames, other]).path
-    files = [f"flow/{split_of(n, output.validation, output.test)}/{n:06d}.flo" for n in range(4)]
+    files = [f"flow/{split_of(n, output)}/{n:06d}.flo" for n in range(4)]
     assert [(out / file).is_file() for file in files] == [True, True, False, False]
     assert list(audit_dataset(out).violations) == []
     records = records_of(out)

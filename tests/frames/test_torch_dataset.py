@@ -62,7 +62,7 @@ def test_layouts_of_other_splits_are_left_out(scene_data: dict[str, Any], write_
     views = scene.spec.output.views
     frames = itertools.islice(FrameStream(scene, quality="fast"), 0, 6 * views, views)
     layouts = [int(target["image_id"]) // views for _, target in frames]
-    assert layouts == [k for k in range(layouts[-1] + 1) if split_of(k, 0.25, 0.25) == "train"]
+    assert layouts == [k for k in range(layouts[-1] + 1) if split_of(k, scene.spec.output) == "train"]
     assert layouts[-1] > 5
     scene_data["output"]["validation"] = 0.75
     with pytest.raises(InputError, match=r"must leave layouts for training \(got 0\.75 and 0\.25\)"):

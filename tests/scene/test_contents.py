@@ -13,6 +13,7 @@ from mitsplat.errors import InputError
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.contents import draw_objects
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.scene_spec import Output
 from mitsplat.scene.splits import draw_environment, is_empty, split_of
 from tests.conftest import WriteScene, box_asset
 
@@ -35,7 +36,7 @@ def drawn(scene: Scene, layout: int) -> list[str]:
 
 
 def counted(scene: Scene, split: str | None = None, layouts: int = 200) -> Counter[str]:
-    wanted = (i for i in range(layouts) if split in (None, split_of(i, scene.spec.output.validation)))
+    wanted = (i for i in range(layouts) if split in (None, split_of(i, scene.spec.output)))
     return Counter(scene.assets[asset].class_name for i in wanted for asset in draw_objects(scene, i)[0])
 
 
@@ -84,7 +85,7 @@ def test_each_split_has_its_share_of_empty_layouts(
     pool_of_four["objects"].append({"asset": "assets/pin", "label": False})
     scene = load_scene(write_scene(pool_of_four | {"empty": share}))
     for split in ("train", "val"):
-        layouts = [i for i in range(200) if split_of(i, 0.25) == split]
+        layouts = [i for i in range(200) if split_of(i, scene.spec.output) == split]
         empty = [i for i in layouts if is_empty(scene.spec, i)]
         assert abs(len(empty) - share * len(layouts)) <= 1
         for index in layouts:
@@ -132,13 +133,12 @@ def test_a_range_of_scales_gives_assets_of_several_sizes(scene_data: SceneData, 
 @pytest.mark.parametrize(("validation", "test"), [(0.2, 0.1), (0.25, 0.25), (0.0, 0.3), (0.7, 0.3), (0.1, 0.6)])
 def test_three_splits_have_their_shares(validation: float, test: float) -> None:
     """For any number of layouts, the error is at most one for each of the two divisions."""
-    splits = [split_of(layout, validation, test) for layout in range(500)]
+    splits = [split_of(layout, Output(validation=validation, test=test)) for layout in range(500)]
     assert splits[1 if test <= 0.5 else 0] == "test"
     for count in (10, 37, 500):
         shares = {"train": 1 - validation - test, "val": validation, "test": test}
         for name, share in shares.items():
             assert abs(splits[:count].count(name) - share * count) < 2, (name, count)
-    assert [split_of(layout, validation) for layout in range(500)] == [split_of(i, validation, 0.0) for i in range(500)]
 
 
 def test_each_of_three_splits_is_balanced_and_has_its_empty_layouts(
@@ -147,7 +147,7 @@ def test_each_of_three_splits_is_balanced_and_has_its_empty_layouts(
     pool_of_four["objects"][0]["balance"] = True
     pool_of_four["output"] |= {"validation": 0.2, "test": 0.2}
     scene = load_scene(write_scene(pool_of_four | {"empty": 0.25}))
-    splits = {index: split_of(index, 0.2, 0.2) for index in range(200)}
+    splits = {index: split_of(index, scene.spec.output) for index in range(200)}
     for split in ("train", "val", "test"):
         layouts = [index for index in splits if splits[index] == split]
         counts = Counter(scene.assets[a].class_name for index in layouts for a in draw_objects(scene, index)[0])
@@ -169,7 +169,7 @@ def test_held_out_assets_are_in_the_test_split_only(
     scene = load_scene(write_scene(pool_of_four | {"hold_out": {"assets": ["assets/pin", "assets/other_nut"]}}))
     seen: dict[bool, set[str]] = {True: set(), False: set()}
     for index in range(200):
-        is_test = split_of(index, 0.25, 0.25) == "test"
+        is_test = split_of(index, scene.spec.output) == "test"
         names = drawn(scene, index)
         seen[is_test] |= set(names)
         assert len(drawn(plain, index)) - len(names) == (0 if is_test else 2)
@@ -209,7 +209,7 @@ def test_held_out_environments_are_in_the_test_split_only(
     spec = load_scene(write_scene(scene_data | held_out)).spec
     seen: dict[bool, set[str]] = {True: set(), False: set()}
     for layout in range(200):
-        seen[split_of(layout, 0.2, 0.25) == "test"].add(names[draw_environment(spec, layout)])
+        seen[split_of(layout, spec.output) == "test"].add(names[draw_environment(spec, layout)])
     assert seen == {True: set(names), False: {"assets/cell", "assets/yard"}}
     with pytest.raises(
         InputError, match=r"hold_out\.environments: must leave at least one environment for training \(got all 3\)"

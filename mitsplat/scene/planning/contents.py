@@ -14,13 +14,13 @@ import numpy as np
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.scene_spec import SceneSpec
+from mitsplat.scene.splits import is_empty, split_of
 from mitsplat.scene.streams import random_stream, weighted_choice
 from mitsplat.scene.walls import pose_matrix
 from mitsplat.storage.files import SPLITS
 
 if TYPE_CHECKING:
     from mitsplat.scene.scene import Scene
-from mitsplat.scene.splits import is_empty, split_of
 
 
 def draw_objects(scene: Scene, layout: int) -> tuple[tuple[int, ...], tuple[Float64Array | None, ...]]:
@@ -72,7 +72,7 @@ def _counts(spec: SceneSpec, layout: int) -> list[int]:
 
 def _held_out(spec: SceneSpec, layout: int) -> frozenset[str]:
     """Return the names of the assets that a layout must not contain because only the test split may."""
-    if not spec.hold_out.assets or split_of(layout, spec.output.validation, spec.output.test) == "test":
+    if not spec.hold_out.assets or split_of(layout, spec.output) == "test":
         return frozenset()
     return frozenset(spec.hold_out.assets)
 
@@ -108,7 +108,7 @@ def _balanced_classes(spec: SceneSpec, position: int, layout: int, count: int, n
     The classes of a split form a sequence of random permutations. The layouts of the split take consecutive parts of
     it.
     """
-    split = split_of(layout, spec.output.validation, spec.output.test)
+    split = split_of(layout, spec.output)
     num_layouts = max(layout + 1, min(1 << layout.bit_length(), spec.output.layouts))
     first = int(_objects_before(spec, position, num_layouts)[layout])
     permutations = {
@@ -124,7 +124,7 @@ def _objects_before(spec: SceneSpec, position: int, layouts: int) -> Int64Array:
     totals = dict.fromkeys(SPLITS, 0)
     before = np.zeros(layouts, dtype=np.int64)
     for layout in range(layouts):
-        split = split_of(layout, spec.output.validation, spec.output.test)
+        split = split_of(layout, spec.output)
         before[layout] = totals[split]
         totals[split] += _counts(spec, layout)[position]
     return before

@@ -144,7 +144,7 @@ def plan_frame(
         index=index,
         layout=number,
         view=view,
-        split=split_of(number, spec.output.validation, spec.output.test),
+        split=split_of(number, spec.output),
         camera=viewpoint.camera,
         next_camera=next_camera,
         lights=lights_at(spec, number, index, time),

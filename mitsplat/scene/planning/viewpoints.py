@@ -7,6 +7,7 @@ viewpoint instead.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -113,18 +114,11 @@ def camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output) -> Cam
     Raises:
         ValueError: If the intrinsics are invalid, such as those of a fisheye lens that sees backwards.
     """
-    width, height = intrinsics.size or (output.width, output.height)
-    if intrinsics.fov_x is not None:
-        fx = 0.5 * width / float(np.tan(0.5 * np.radians(intrinsics.fov_x)))
-    else:
-        fx = float(intrinsics.fx or 0.0)
+    size = intrinsics.size or (output.width, output.height)
     camera = Camera(
-        width=width,
-        height=height,
-        fx=fx,
-        fy=fx if intrinsics.fy is None else intrinsics.fy,
-        cx=width / 2 if intrinsics.cx is None else intrinsics.cx,
-        cy=height / 2 if intrinsics.cy is None else intrinsics.cy,
+        *size,
+        *intrinsics.focal_lengths(size),
+        *intrinsics.principal_point(size),
         world_from_camera=pose,
         distortion=intrinsics.distortion,
         lens=intrinsics.lens,
@@ -147,54 +141,87 @@ def _orbit_pose(camera: CameraOrbit, view: int, views: int) -> Float64Array:
 
 
 def _hemisphere_view(scene: Scene, index: int, camera: CameraHemisphere, layout: Layout | None) -> Viewpoint:
+    """Return the viewpoint of a frame: the best candidate view, or the first one whose eye is outside of solids."""
+    lens, drawn_motion = _camera_of_frame(scene.spec, index, np.eye(4))
+    predictor = None
+    if layout is not None and (camera.look_at == "objects" or camera.selects_views):
+        predictor = VisibilityPredictor.of(scene, layout)
+    candidates = _candidate_views(camera, lens, scene.spec.seed, index, predictor)
+    if predictor is not None and camera.selects_views:
+        best = _best_view(scene, index, camera, predictor, candidates)
+        return replace(best, drawn=best.drawn | drawn_motion)
+    solid = ""
+    for view in candidates:
+        solid = "" if layout is None else containing_solid(scene, layout, view.camera.centre)
+        if not solid:
+            aim = {} if camera.look_at == "target" else {"target": view.target.tolist(), "object": view.seen}
+            return Viewpoint(view.camera, drawn_motion | aim)
+    raise InputError(
+        f"{scene.path}: camera: all {camera.tries} eyes drawn for frame {index} are in a solid (the last in "
+        f"{solid}); widen the camera's ranges"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """Candidate view of a frame.
+
+    Attributes:
+        number: Number of the candidate, from 0.
+        camera: The camera.
+        target: Point in the centre of the image [m], shape (3,).
+        seen: Id of the instance in the centre of the image, if one was drawn.
+    """
+
+    number: int
+    camera: Camera
+    target: Float64Array
+    seen: int | None
+
+
+def _candidate_views(
+    camera: CameraHemisphere, lens: Camera, seed: int, index: int, predictor: VisibilityPredictor | None
+) -> Iterator[_Candidate]:
+    """Yield the candidate views of a frame; with target shares of cut objects, every other one has a border target."""
+    for number in range(camera.tries):
+        middle, seen = _target(camera, seed, index, number, predictor)
+        pose, target = _hemisphere_pose(camera, seed, index, number, middle)
+        if camera.truncation is not None and number % 2:
+            rng = _stream(seed, "camera border", index, number)
+            pose, target = _rotate_target_to_border(lens, pose, target, rng)
+        yield _Candidate(number, replace(lens, world_from_camera=pose), target, seen)
+
+
+def _best_view(
+    scene: Scene,
+    index: int,
+    camera: CameraHemisphere,
+    predictor: VisibilityPredictor,
+    candidates: Iterable[_Candidate],
+) -> Viewpoint:
     """Return the accepted candidate view whose shares of hidden and cut objects are nearest to the targets.
 
     The search ends at the first accepted candidate that meets the targets exactly.
     """
-    spec = scene.spec
-    lens, drawn_motion = _camera_of_frame(spec, index, np.eye(4))
-    predictor = (
-        None
-        if layout is None or (camera.look_at == "target" and not camera.selects_views)
-        else VisibilityPredictor.of(scene, layout)
-    )
-    if predictor is None or not camera.selects_views:
-        for number in range(camera.tries):
-            target, seen = _target(camera, spec.seed, index, number, predictor)
-            pose, target = _hemisphere_pose(camera, spec.seed, index, number, target)
-            solid = "" if layout is None else containing_solid(scene, layout, pose[:3, 3])
-            if not solid:
-                aim = {} if camera.look_at == "target" else {"target": target.tolist(), "object": seen}
-                return Viewpoint(replace(lens, world_from_camera=pose), {**drawn_motion, **aim})
-        raise InputError(
-            f"{scene.path}: camera: all {camera.tries} eyes drawn for frame {index} are in a solid (the last in "
-            f"{solid}); widen the camera's ranges"
-        )
-    shares = (camera.occlusion, camera.truncation)
-    rounding = random_stream(spec.seed, "camera shares", index).uniform(size=2)
+    shares = [0.0 if target is None else target.share for target in (camera.occlusion, camera.truncation)]
+    rounding = random_stream(scene.spec.seed, "camera shares", index).uniform(size=2)
     best: tuple[float, Viewpoint] | None = None
     refused: list[tuple[float, str]] = []
-    for number in range(camera.tries):
-        target, seen = _target(camera, spec.seed, index, number, predictor)
-        pose, target = _hemisphere_pose(camera, spec.seed, index, number, target)
-        if camera.truncation is not None and number % 2:
-            rng = _stream(spec.seed, "camera border", index, number)
-            pose, target = _rotate_target_to_border(lens, pose, target, rng)
-        view_camera = replace(lens, world_from_camera=pose)
-        projected = predictor.project(view_camera)
+    for view in candidates:
+        projected = predictor.project(view.camera)
         if violations := predictor.find_violations(projected, camera.accept or Acceptance()):
             refused.append((sum(miss for miss, _ in violations), " and ".join(text for _, text in violations)))
             continue
-        prediction = predictor.predict(projected, camera.occlusion, camera.truncation, spec.labels.min_pixels)
-        drawn = {
-            "target": target.tolist(),
-            "object": seen,
-            "attempt": number,
-            "predicted": prediction.to_json(),
-        } | drawn_motion
-        cost = _cost(prediction, [0.0 if share is None else share.share for share in shares], rounding)
+        prediction = predictor.predict(projected, camera.occlusion, camera.truncation, scene.spec.labels.min_pixels)
+        cost = _cost(prediction, shares, rounding)
         if best is None or cost < best[0]:
-            best = cost, Viewpoint(view_camera, drawn)
+            drawn = {
+                "target": view.target.tolist(),
+                "object": view.seen,
+                "attempt": view.number,
+                "predicted": prediction.to_json(),
+            }
+            best = cost, Viewpoint(view.camera, drawn)
         if cost == 0:
             break
     if best is None:

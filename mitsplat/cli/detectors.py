@@ -82,7 +82,8 @@ def train(
 
     Nothing is downloaded: the initial weights are random or read from a file. Requires the extra `train`.
     """
-    from mitsplat.detector.training import TrainSettings, train_detector
+    from mitsplat.detector.train_settings import TrainSettings
+    from mitsplat.detector.training import train_detector
 
     settings = TrainSettings(
         model=model,

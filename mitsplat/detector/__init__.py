@@ -13,8 +13,9 @@ from mitsplat.detector.detector_evaluation import Evaluation, evaluate_detector
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.likeness import Likeness, compare_with_photographs
-from mitsplat.detector.scores import AveragePrecision, DetectionMatches, average_precision
-from mitsplat.detector.training import Run, TrainSettings, open_run, train_detector
+from mitsplat.detector.scores import AveragePrecision, DetectionMatches
+from mitsplat.detector.train_settings import TrainSettings
+from mitsplat.detector.training import Run, open_run, train_detector
 
 __all__ = [
     "AveragePrecision",
@@ -24,7 +25,6 @@ __all__ = [
     "Likeness",
     "Run",
     "TrainSettings",
-    "average_precision",
     "compare_with_photographs",
     "evaluate_detector",
     "open_run",

@@ -25,6 +25,7 @@ from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, Sample, Sp
 from mitsplat.detector.labelled_sets.pictures import read_upright
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import (
+    STRIDE,
     check_device,
     check_torchvision,
     check_weights,
@@ -107,8 +108,8 @@ def evaluate_detector(
     trained, root = open_run(run), Path(data)
     check_device(device)
     size = int(trained.record["settings"]["size"]) if size is None else size
-    if size < 32 or size % 32:
-        raise InputError(f"--size must be a multiple of 32 px (got {size})")
+    if size < STRIDE or size % STRIDE:
+        raise InputError(f"--size must be a multiple of {STRIDE} px (got {size})")
     found = reorder_classes(read_set(root, split, progress), trained.class_names, str(trained.path))
     if trained.has_masks:
         check_masks(found)

@@ -78,9 +78,13 @@ def _classes(scores: Mapping[str, AveragePrecision], results: JsonObject) -> str
         values = [value for score in scores.values() for value in score.classes.get(name, (None, None))]
         cells = "".join(f"<td>{'no labels' if value is None else f'{value:.3f}'}</td>" for value in values)
         rows.append(f'<tr><th scope="row">{html.escape(name)}</th><td>{count}</td>{cells}</tr>')
-    head = "".join(f'<th scope="col">{text}</th>' for text in ("Class", "Labelled", *heads))
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    return make_section("classes", "Classes", table)
+    return make_section("classes", "Classes", _headed_table(("Class", "Labelled", *heads), rows))
+
+
+def _headed_table(heads: Sequence[str], rows: Sequence[str]) -> str:
+    """Build a table of rows below column headings; all are HTML."""
+    head = "".join(f'<th scope="col">{text}</th>' for text in heads)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
 
 
 def _charts(scores: Mapping[str, AveragePrecision]) -> str:
@@ -111,7 +115,6 @@ def _gains(found: Mapping[str, float]) -> str:
 
 def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
     names = [html.escape(name) for name in (*class_names, "nothing")]
-    head = "".join(f'<th scope="col">{name}</th>' for name in ("labelled \\ found", *names))
     rows = []
     for i, (name, row) in enumerate(zip(names, confusion.matrix, strict=True)):
         total = max(int(row.sum()), 1)
@@ -122,7 +125,7 @@ def _confusion(confusion: Confusion, class_names: Sequence[str]) -> str:
             cells.append(f"<td{shade if count else ''}>{count or ''}</td>")
         rows.append(f'<tr><th scope="row">{name}</th>{"".join(cells)}</tr>')
     text = f"Labelled and detected classes, for scores of at least {CONFIDENCE} and a box IoU of at least {IOU}."
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    table = _headed_table(("labelled \\ found", *names), rows)
     return make_section("confusion", "Confusion", f'<p>{text}</p><div class="matrix">{table}</div>')
 
 

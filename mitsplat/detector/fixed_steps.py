@@ -30,6 +30,7 @@ from ultralytics.utils.torch_utils import strip_optimizer
 
 from mitsplat.arrays import Int64Array
 from mitsplat.detector.libraries import WEIGHTS_ERRORS, linked_weights
+from mitsplat.detector.train_settings import TrainSettings
 from mitsplat.errors import InputError, MissingResourceError
 
 EPOCH = 50
@@ -93,31 +94,25 @@ class TrainingOutcome:
     optimizer: str
 
 
-def train_job(
-    job: Job, *, network: str, weights: Path | None, size: int, mirror: bool, seed: int, device: str, workers: int
-) -> TrainingOutcome:
+def train_job(job: Job, settings: TrainSettings, *, device: str, workers: int) -> TrainingOutcome:
     """Train a detector; resume from the checkpoint of the run if there is one.
 
     Args:
         job: Inputs of the training.
-        network: Name of the network's YAML file.
-        weights: File of initial weights, or None for random weights.
-        size: Longer side of the images [px].
-        mirror: True to mirror half of the images left to right.
-        seed: Seed of all random numbers.
+        settings: Network, initial weights, image size, mirroring and seed; the job determines steps and batches.
         device: Device name of Ultralytics.
         workers: Number of processes that read images; 0 on the CPU.
     """
     epochs, batch = job.epochs, job.plan.shape[1]
-    settings: dict[str, Any] = {
+    options: dict[str, Any] = {
         "task": "segment" if job.masks else "detect",
-        "model": network,
+        "model": settings.model,
         "epochs": epochs,
         "batch": batch,
         "nbs": batch,  # one update of the weights per batch
-        "imgsz": size,
-        "fliplr": 0.5 if mirror else 0.0,
-        "seed": seed,
+        "imgsz": settings.size,
+        "fliplr": 0.5 if settings.mirror else 0.0,
+        "seed": settings.seed,
         "deterministic": True,
         "device": device,
         "workers": workers,
@@ -141,10 +136,10 @@ def train_job(
     callbacks["on_train_batch_end"].append(_FixedStepsTrainer.end_step)
     last = job.run / LAST_CHECKPOINT
     with ExitStack() as links:
-        settings["pretrained"] = links.enter_context(linked_weights(weights)) if weights else False
+        options["pretrained"] = links.enter_context(linked_weights(settings.weights)) if settings.weights else False
         if last.is_file():
-            settings["resume"] = links.enter_context(linked_weights(last))
-        trainer = (_MaskTrainer if job.masks else _BoxTrainer)(job, settings, callbacks)
+            options["resume"] = links.enter_context(linked_weights(last))
+        trainer = (_MaskTrainer if job.masks else _BoxTrainer)(job, options, callbacks)
         trainer.train()
     return trainer.outcome()
 
@@ -189,9 +184,9 @@ class _PlanSampler(Sampler[int]):
 class _FixedStepsTrainer:
     """Common part of the box and the mask trainer."""
 
-    def __init__(self, job: Job, settings: dict[str, Any], callbacks: dict[str, list[Callable[[Any], None]]]) -> None:
+    def __init__(self, job: Job, options: dict[str, Any], callbacks: dict[str, list[Callable[[Any], None]]]) -> None:
         self.job, self.order, self.taken, self.updates = job, _PlanSampler(job.plan), 0, 0
-        super().__init__(overrides=settings, _callbacks=callbacks)  # type: ignore[call-arg]
+        super().__init__(overrides=options, _callbacks=callbacks)  # type: ignore[call-arg]
 
     def get_dataset(self) -> dict[str, Any]:
         """Return the content of a ``data.yaml``.

@@ -160,8 +160,8 @@ def compare_with_photographs(
     Raises:
         InputError: If there is nothing to compare, or a file cannot be read.
     """
-    if size < 32:
-        raise InputError(f"size must be 32 px or more (got {size})")
+    if size < STRIDE:
+        raise InputError(f"size must be {STRIDE} px or more (got {size})")
     if max_images < 1:
         raise InputError(f"the number of images per side must be at least 1 (got {max_images})")
     real = read_set(photographs, "all")

@@ -115,20 +115,6 @@ class DetectionMatches:
         )
 
 
-def average_precision(
-    truth: JsonObject, detections: Sequence[Detection], images: Sequence[int] | None = None, iou_type: IouType = "bbox"
-) -> AveragePrecision:
-    """Compute the average precision of stored detections; use :class:`DetectionMatches` for many samples of images.
-
-    Args:
-        truth: The labels.
-        detections: The detections.
-        images: Image ids, which may repeat; all images if None.
-        iou_type: Overlap of boxes or of masks.
-    """
-    return DetectionMatches(truth, detections, iou_type).average_precision(images)
-
-
 @dataclass(frozen=True, eq=False)
 class Confusion:
     """Confusion matrix of detections with a score of at least :data:`CONFIDENCE` and a box IoU of at least :data:`IOU`.

@@ -19,14 +19,12 @@ import shutil
 import time
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, check_masks, reorder_classes
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import (
-    STRIDE,
-    check_device,
     check_weights,
     load_libraries,
     read_network,
@@ -35,10 +33,10 @@ from mitsplat.detector.libraries import (
 )
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.photo_tiles import cut_photographs
+from mitsplat.detector.train_settings import TrainSettings
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores
-from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.files import JsonObject, open_in_place, read_json, remove_folder, storage_errors, write_text
 
 RUN_FILE = "run.json"
@@ -50,61 +48,6 @@ _RUN_FILES = frozenset(
 """Names of files that a run folder may contain, in addition to temporary files."""
 _SET_KEYS = ("datasets", "real")
 _MAX_WORKERS = 8
-
-
-@dataclass(frozen=True)
-class TrainSettings:
-    """Settings that, together with the images, determine the weights of a detector.
-
-    Attributes:
-        model: YAML file of an Ultralytics network, with masks (``yolo11n-seg``) or only boxes (``yolo11n``).
-        weights: File of initial weights; random weights if None. Nothing is ever downloaded.
-        steps: Number of batches, each with one update of the weights, independent of the number of images.
-        batch: Images per step.
-        size: Longer side to which images are scaled [px], a multiple of 32.
-        share: Share of real images in the steps, if there are real images.
-        real_size: Longer side of photographs at prediction [px]. If it is larger than ``size``, photographs are cut to
-            tiles that show objects at this size.
-        mirror: True to mirror half of the images left to right. This is wrong for printed text and for classes that
-            differ only as left and right parts.
-        seed: Seed of all random numbers.
-        device: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``, with PyTorch's GPU numbers.
-        workers: Number of additional processes that read images; if None, up to 8. There are none on the CPU.
-    """
-
-    model: str = "yolo11n-seg.yaml"
-    weights: Path | None = None
-    steps: int = 1500
-    batch: int = 16
-    size: int = 640
-    share: float = 0.1
-    real_size: int | None = None
-    mirror: bool = True
-    seed: int = 0
-    device: str = "auto"
-    workers: int | None = None
-
-    def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("batch", 1), ("size", 2 * STRIDE), ("seed", 0), ("workers", 0)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise InputError(f"{name} must be {least} or more (got {value})")
-        if self.seed >= 2**32:
-            raise InputError(f"seed must be less than 2^32 (got {self.seed})")
-        if self.size % STRIDE:
-            raise InputError(f"size must be a multiple of {STRIDE} px (got {self.size})")
-        if not 0 < self.share < 1:
-            raise InputError(f"share of real images must lie between 0 and 1 (got {self.share:g})")
-        if self.real_size is not None and self.real_size < self.size:
-            raise InputError(f"real_size must be at least size, {self.size} px (got {self.real_size})")
-        check_device(self.device)
-        if self.weights is not None:
-            object.__setattr__(self, "weights", Path(self.weights))
-
-    def weight_settings(self) -> JsonObject:
-        """Return the settings that affect the weights, without ``device`` and ``workers``."""
-        settings = asdict(self) | {"weights": None if self.weights is None else file_hash(self.weights)}
-        return {name: value for name, value in settings.items() if name not in ("device", "workers")}
 
 
 @dataclass(frozen=True)
@@ -319,16 +262,7 @@ def _train(
     if (out / fixed_steps.LAST_CHECKPOINT).is_file() and fixed_steps.epochs_done(out) in (0, job.epochs):
         fixed_steps.finish_checkpoint(out)  # the process ended between the last step and the export of the weights
         return counts | {"seconds": 0.0, "resumed_at_step": settings.steps}
-    outcome = fixed_steps.train_job(
-        job,
-        network=settings.model,
-        weights=settings.weights,
-        size=settings.size,
-        mirror=settings.mirror,
-        seed=settings.seed,
-        device=device,
-        workers=0 if device == "cpu" else workers,
-    )
+    outcome = fixed_steps.train_job(job, settings, device=device, workers=0 if device == "cpu" else workers)
     return counts | {
         "updates_of_weights": outcome.updates,
         "optimizer": outcome.optimizer,

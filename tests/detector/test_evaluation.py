@@ -14,7 +14,7 @@ from mitsplat.detector.detector_evaluation import Evaluation, coco_truth, evalua
 from mitsplat.detector.detector_report import worst_images
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet
 from mitsplat.detector.labelled_sets.set_reading import read_set
-from mitsplat.detector.scores import Confusion, average_precision
+from mitsplat.detector.scores import Confusion, DetectionMatches
 from mitsplat.errors import InputError
 from tests.conftest import contents
 from tests.detector.painted import write_coco, write_yolo
@@ -58,7 +58,7 @@ def test_stored_results_follow_from_stored_truth_and_detections(judged: tuple[La
     assert results == evaluation.results and detections == guesses(found)
     assert [image["file_name"] for image in truth["images"]] == [sample.name for sample in found.samples]
     for key, kind in (("box", "bbox"), ("mask", "segm")):
-        score = average_precision(truth, detections, iou_type=kind)  # type: ignore[arg-type]
+        score = DetectionMatches(truth, detections, kind).average_precision()  # type: ignore[arg-type]
         assert 0 < score.map50_95 < score.map50 < 1 or key == "mask"
         assert results[key]["map50_95"] == round(score.map50_95, 5)
         assert results[key]["classes"]["disc"]["ap50"] == round(score.classes["disc"][1], 5)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from mitsplat.detector import average_precision
+from mitsplat.detector import DetectionMatches
 from mitsplat.detector.losses import ERROR_KINDS
 from mitsplat.detector.losses import error_gains as gains_over
 
@@ -31,7 +31,7 @@ def found(image: int, kind: int, box: list[float], score: float = 0.9) -> dict[s
 
 
 def gains(labelled: dict[str, Any], detections: list[dict[str, Any]]) -> dict[str, float]:
-    return gains_over(labelled, detections, average_precision(labelled, detections))
+    return gains_over(labelled, detections, DetectionMatches(labelled, detections).average_precision())
 
 
 TWO = truth((1, 1, A), (1, 2, B))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsplat.detector.scores import DetectionMatches, average_precision, confuse, match_boxes
+from mitsplat.detector.scores import DetectionMatches, confuse, match_boxes
 from mitsplat.errors import InputError
 
 
@@ -51,7 +51,7 @@ def test_average_precision_equals_a_case_computed_by_hand() -> None:
         found(2, 1, [0, 0, 10, 10], 0.7),
         found(3, 2, [10, 10, 30, 18], 0.5),
     ]
-    score = average_precision(TRUE, detections)
+    score = DetectionMatches(TRUE, detections).average_precision()
     a = (34 + 33 * 2 / 3) / 101
     assert score.classes["a"] == pytest.approx((a, a), abs=1e-9)
     assert score.classes["b"] == pytest.approx((0.3, 1.0), abs=1e-9)
@@ -66,9 +66,9 @@ def test_perfect_detections_score_one_and_none_score_zero() -> None:
         for a in TRUE["annotations"]
     ]
     for kind in ("bbox", "segm"):
-        score = average_precision(TRUE, perfect, iou_type=kind)  # type: ignore[arg-type]
+        score = DetectionMatches(TRUE, perfect, kind).average_precision()  # type: ignore[arg-type]
         assert (score.map50_95, score.map50) == (1.0, 1.0)
-    assert average_precision(TRUE, []).map50_95 == 0.0
+    assert DetectionMatches(TRUE, []).average_precision().map50_95 == 0.0
 
 
 def test_a_subset_of_images_is_scored_independently() -> None:
@@ -83,14 +83,14 @@ def test_a_subset_of_images_is_scored_independently() -> None:
     matches = DetectionMatches(labelled, detections)
     for chosen in ([1, 2, 3], [8, 4], [5]):
         alone = truth({i: images[i] for i in chosen})
-        expected = average_precision(alone, [d for d in detections if d["image_id"] in chosen])
+        expected = DetectionMatches(alone, [d for d in detections if d["image_id"] in chosen]).average_precision()
         assert matches.average_precision(chosen).classes == expected.classes
-        assert average_precision(labelled, detections, chosen).map50_95 == expected.map50_95
-    assert matches.average_precision().classes == average_precision(labelled, detections).classes
+        assert DetectionMatches(labelled, detections).average_precision(chosen).map50_95 == expected.map50_95
+    assert matches.average_precision().classes == DetectionMatches(labelled, detections).average_precision().classes
     # An image that is drawn twice counts as two images with the same content.
     twice = truth({1: images[1], 2: images[2], 3: images[1]})
     drawn = [d | {"image_id": n} for n, i in ((1, 1), (2, 2), (3, 1)) for d in detections if d["image_id"] == i]
-    assert matches.average_precision([1, 2, 1]).classes == average_precision(twice, drawn).classes
+    assert matches.average_precision([1, 2, 1]).classes == DetectionMatches(twice, drawn).average_precision().classes
     # Earlier calls do not change the result.
     assert (
         matches.average_precision([1, 2, 3]).classes
@@ -99,17 +99,17 @@ def test_a_subset_of_images_is_scored_independently() -> None:
 
 
 def test_classes_without_a_label_do_not_count() -> None:
-    score = average_precision(TRUE, [found(3, 2, [10, 10, 30, 30], 0.9)], images=[3])
+    score = DetectionMatches(TRUE, [found(3, 2, [10, 10, 30, 30], 0.9)]).average_precision([3])
     assert list(score.classes) == ["b"]
     assert (*score.classes["b"], score.map50_95) == pytest.approx((1, 1, 1))
 
 
 def test_detections_of_unlabelled_images_and_classes_are_refused() -> None:
     with pytest.raises(InputError, match="got image 9, class 1"):
-        average_precision(TRUE, [found(9, 1, [0, 0, 5, 5], 0.5)])
+        DetectionMatches(TRUE, [found(9, 1, [0, 0, 5, 5], 0.5)]).average_precision()
     for images in ([], [7]):
         with pytest.raises(InputError, match="images must be a non-empty list of labelled images"):
-            average_precision(TRUE, [], images)
+            DetectionMatches(TRUE, []).average_precision(images)
 
 
 def test_the_confusion_matrix_counts_each_kind_of_error() -> None:

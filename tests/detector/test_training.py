@@ -25,8 +25,9 @@ from mitsplat.detector.detector_evaluation import coco_truth, evaluate_detector
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import check_weights, load_weights
 from mitsplat.detector.mix import plan_images
-from mitsplat.detector.scores import average_precision
-from mitsplat.detector.training import RUN_FILE, Run, TrainSettings, open_run, train_detector, write_data
+from mitsplat.detector.scores import DetectionMatches
+from mitsplat.detector.train_settings import TrainSettings
+from mitsplat.detector.training import RUN_FILE, Run, open_run, train_detector, write_data
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.storage.content_hash import file_hash
 from tests.conftest import contents
@@ -81,8 +82,8 @@ def no_libraries(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """Mock an installed Ultralytics, and return the recorded training jobs."""
     asked: list[dict[str, Any]] = []
 
-    def train_job(job: Any, **settings: Any) -> SimpleNamespace:
-        asked.append({"job": job, **settings})
+    def train_job(job: Any, settings: TrainSettings, **_: Any) -> SimpleNamespace:
+        asked.append({"job": job, "settings": settings})
         (job.run / "weights.pt").write_bytes(b"weights")
         for step in range(len(job.plan)):
             job.step(step + 1, 1.0)
@@ -114,7 +115,11 @@ def test_a_run_records_its_datasets_and_settings(no_libraries: list[dict[str, An
         [cell, cell], tmp_path / "run", TINY, real=photographs, progress=lambda *args: told.append(args)
     )
     (asked,) = no_libraries
-    assert asked["network"] == "yolo11n-seg.yaml" and asked["job"].masks and asked["job"].class_names == ("disc", "box")
+    assert (
+        asked["settings"].model == "yolo11n-seg.yaml"
+        and asked["job"].masks
+        and asked["job"].class_names == ("disc", "box")
+    )
     assert len(asked["job"].plan) == 4 and (asked["job"].plan >= 10).sum() == 4
     assert told[-1][:2] == (4, 4)
     record = json.loads((tmp_path / "run/run.json").read_text())
@@ -135,9 +140,9 @@ def test_photographs_are_cut_to_tiles_of_the_test_size(no_libraries: list[dict[s
     listed: list[str] = []
     train_job = sys.modules["mitsplat.detector.fixed_steps"].train_job
 
-    def look(job: Any, **settings: Any) -> Any:
+    def look(job: Any, settings: TrainSettings, **options: Any) -> Any:
         listed.extend(job.images.read_text().splitlines())
-        return train_job(job, **settings)
+        return train_job(job, settings, **options)
 
     sys.modules["mitsplat.detector.fixed_steps"].train_job = look  # type: ignore[attr-defined]
     run = train_detector([cell], tmp_path / "run", _other(real_size=96), real=photographs)
@@ -502,7 +507,7 @@ def test_precision_agrees_with_ultralytics(data: Path, trained: Run, tmp_path: P
     evaluation = evaluate_detector(trained.path, data / "cell", tmp_path / "out", device="cpu")
     truth = coco_truth(found, masks=True)
     for kind, iou_type, own in (("box", "bbox", theirs.box), ("mask", "segm", theirs.seg)):
-        score, result = average_precision(truth, predictions, iou_type=iou_type), evaluation.results[kind]  # type: ignore[arg-type]
+        score, result = DetectionMatches(truth, predictions, iou_type).average_precision(), evaluation.results[kind]  # type: ignore[arg-type]
         assert score.map50_95 > 0.3
         assert (own.map, own.map50) == pytest.approx((score.map50_95, score.map50), abs=0.006)
         assert (result["map50_95"], result["map50"]) == pytest.approx((score.map50_95, score.map50), abs=0.005)

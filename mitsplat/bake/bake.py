@@ -27,11 +27,12 @@ from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.bake.radiance import BOUNCES, bake_radiance, hemisphere, ray_offset, rotate_directions
 from mitsplat.bake.size_checks import check_size, mass_warnings
 from mitsplat.bake.surface_materials import SurfaceFinish
-from mitsplat.bake.verification import BakedView, PictureFunction, compare_views, compare_with_textures
+from mitsplat.bake.verification import BakedView, MeshPictures, compare_views, compare_with_textures
 from mitsplat.errors import InputError
 from mitsplat.fit.refine_splats import Picture, refine_splats
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import Surfels
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.camera_poses import spiral
@@ -40,6 +41,7 @@ from mitsplat.images.colour import encode_srgb
 from mitsplat.mesh_files.mesh_file import MeshFile
 from mitsplat.progress import Progress
 from mitsplat.renderer.path_tracing import render_mesh, trace_radiance
+from mitsplat.renderer.scene_emitters import MitsubaDict
 from mitsplat.runtime.variant import ensure_variant, one_at_a_time
 from mitsplat.scene.spec.light_spec import DrawnLight, LightSpec
 
@@ -171,43 +173,28 @@ def bake_asset(
     settings = BakeSettings() if settings is None else settings
     check_type(settings, BakeSettings, "settings", "for example mitsplat.BakeSettings(gaussians=10000)")
     check_text(name, "name")
-    if metres_per_unit is not None:
-        check_number(metres_per_unit, "metres_per_unit")
-    check_list(cameras, Camera, "cameras")
-    check_list(fit_cameras, Camera, "fit_cameras")
-    check_list(pieces, trimesh.Trimesh, "pieces")
-    if lights is not None:
-        check_list(lights, DrawnLight, "lights")
-    _check_values(kind, up, density, friction)
+    for values, member, place in (
+        *((cameras, Camera, "cameras"), (fit_cameras, Camera, "fit_cameras")),
+        *((pieces, trimesh.Trimesh, "pieces"), (() if lights is None else lights, DrawnLight, "lights")),
+    ):
+        check_list(values, member, place)
+    _check_values(kind, metres_per_unit, up, density, friction)
     stages = _Stages(progress)
     emitters = None if lights is None else bake_lights(lights)
     model = read_model(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish)
-    parts = model.parts
-    surface = MeshSurface(parts)
+    surface = MeshSurface(model.parts)
     source = str(mesh) if isinstance(mesh, str | Path) else name
     check_size(source, surface.mesh, model.units, kind, any_size=any_size, has_pieces=bool(pieces))
     stages("placing Gaussians")
     rng = np.random.default_rng(settings.seed)
-    surfels = _place_visible_surfels(surface, parts, settings, rng)
-    if not len(surfels):
-        raise InputError(
-            f"{name}: no point of the mesh is visible from outside; check whether its faces are inside out"
-        )
-    if emitters is None:
-        colours, materials = surface.sample_surfels(surfels, rng)
-        splats = surfels.splats((colours[:, None] - 0.5) / SH_C0)
-        picture, samples = surface.picture, _BASE_COLOUR_SAMPLES
-    else:
-        scene = mitsuba_scene(parts, emitters)
-        splats, materials = bake_radiance(scene, surfels, rng, stages.step), None
-        picture, samples = partial(_trace_picture, scene), _RADIANCE_SAMPLES
+    surfels = _place_visible_surfels(name, surface, model.parts, settings, rng)
+    splats, materials, pictures = _surfel_splats(surface, model.parts, surfels, emitters, rng, stages)
     if settings.fit_steps:
         fit_cameras = fit_cameras or _orbit(surface.mesh, _FIT_VIEWS, turn=0.0)
-        splats = _fit_splats(splats, picture, fit_cameras, samples[0], settings, stages)
+        splats = _fit_splats(splats, pictures, fit_cameras, settings, stages)
     splats = replace(splats, materials=materials)
     stages("finding convex pieces")
-    proxy = make_proxy(parts, settings.proxy_faces)
-    area = np.array([part.mesh.area for part in parts])
+    proxy = make_proxy(model.parts, settings.proxy_faces)
     asset = Asset(
         name=name,
         class_name=class_name or name,
@@ -217,8 +204,8 @@ def bake_asset(
         kind=kind,
         density=density,
         friction=friction,
-        roughness=float(np.average([part.roughness for part in parts], weights=area)),
-        specular=float(np.average([part.specular for part in parts], weights=area)),
+        roughness=_mean_over_area(model.parts, "roughness"),
+        specular=_mean_over_area(model.parts, "specular"),
         capture_light="uniform" if lights is None else "scene",
         white=None if lights is None else float(np.pi),
     )
@@ -227,22 +214,20 @@ def bake_asset(
     result = BakeResult(asset, surface=surface.mesh, units=_describe_units(model))
     if settings.verify_views:
         cameras = cameras or _orbit(surface.mesh, settings.verify_views)
-        views, psnr, psnr_object = compare_views(picture, splats, cameras, samples[1], settings.seed, stages.step)
+        views, psnr, psnr_object = compare_views(pictures, splats, cameras, settings.seed, stages.step)
         result = replace(result, views=views, psnr=psnr, psnr_object=psnr_object)
-        if lights is None:
-            brightness, different = compare_with_textures(parts, splats, surface.parts_of(surfels.faces))
-            result = replace(result, brightness=brightness)
-            warnings += [
-                f"the splats of part {part!r} are {ratio:.2g} times as bright as its texture in the file: check the "
-                "factor of its material"
-                for part, ratio in different.items()
-            ]
+    if settings.verify_views and lights is None:
+        brightness, different = compare_with_textures(model.parts, splats, surface.parts_of(surfels.faces))
+        result = replace(result, brightness=brightness)
+        warnings += _texture_warnings(different)
     stages.end()
     return replace(result, warnings=tuple(warnings))
 
 
-def _check_values(kind: str, up: str | None, density: float, friction: float) -> None:
+def _check_values(kind: str, metres_per_unit: float | None, up: str | None, density: float, friction: float) -> None:
     """Raise InputError if a value of a bake breaks a rule."""
+    if metres_per_unit is not None:
+        check_number(metres_per_unit, "metres_per_unit")
     check_number(density, "density")
     check_number(friction, "friction")
     if kind not in ("object", "environment"):
@@ -256,9 +241,13 @@ def _check_values(kind: str, up: str | None, density: float, friction: float) ->
 
 
 def _place_visible_surfels(
-    surface: MeshSurface, parts: Sequence[MeshPart], settings: BakeSettings, rng: np.random.Generator
+    name: str, surface: MeshSurface, parts: Sequence[MeshPart], settings: BakeSettings, rng: np.random.Generator
 ) -> Surfels:
-    """Place surfels on the visible surface, about as many as the settings state."""
+    """Place surfels on the visible surface of an asset, about as many as the settings state.
+
+    Raises:
+        InputError: If no point of the surface is visible.
+    """
     relative = settings.density or {}
     face_density = np.concatenate(
         [relative.get(part.name, 1.0) * part.detail_density(_DETAIL_GAIN, rng) for part in parts]
@@ -268,7 +257,38 @@ def _place_visible_surfels(
     trial = surface.place_surfels(face_density, min(_TRIAL_GAUSSIANS, settings.gaussians), rng)
     share = float(_visible_surfels(clay, trial, rng).mean()) if len(trial) else 1.0
     surfels = surface.place_surfels(face_density, round(settings.gaussians / max(share, 0.2)), rng)
-    return surfels.subset(_visible_surfels(clay, surfels, rng))
+    visible = surfels.subset(_visible_surfels(clay, surfels, rng))
+    if not len(visible):
+        raise InputError(
+            f"{name}: no point of the mesh is visible from outside; check whether its faces are inside out"
+        )
+    return visible
+
+
+def _surfel_splats(
+    surface: MeshSurface,
+    parts: Sequence[MeshPart],
+    surfels: Surfels,
+    emitters: MitsubaDict | None,
+    rng: np.random.Generator,
+    stages: _Stages,
+) -> tuple[Splats, SplatMaterials | None, MeshPictures]:
+    """Return Gaussians at the surfels, their materials, and pictures of the mesh.
+
+    With ``emitters``, the Gaussians show the radiance under these lights and have no materials.
+    """
+    if emitters is None:
+        colours, materials = surface.sample_surfels(surfels, rng)
+        splats = surfels.splats((colours[:, None] - 0.5) / SH_C0)
+        return splats, materials, MeshPictures(surface.picture, *_BASE_COLOUR_SAMPLES)
+    scene = mitsuba_scene(parts, emitters)
+    splats = bake_radiance(scene, surfels, rng, stages.step)
+    return splats, None, MeshPictures(partial(_trace_picture, scene), *_RADIANCE_SAMPLES)
+
+
+def _mean_over_area(parts: Sequence[MeshPart], name: Literal["roughness", "specular"]) -> float:
+    """Return the mean of a material parameter over the area of all parts."""
+    return float(np.average([getattr(part, name) for part in parts], weights=[part.mesh.area for part in parts]))
 
 
 def _mesh_warnings(model: MeshModel, solid: MeshSurface | None, seed: int) -> list[str]:
@@ -281,6 +301,15 @@ def _mesh_warnings(model: MeshModel, solid: MeshSurface | None, seed: int) -> li
             "give it a thickness, or state doubleSided in a glTF file"
         )
     return warnings
+
+
+def _texture_warnings(different: Mapping[str, float]) -> list[str]:
+    """Return the warnings of parts whose splats are brighter or darker than their textures, by the ratio of both."""
+    return [
+        f"the splats of part {part!r} are {ratio:.2g} times as bright as its texture in the file: check the factor of "
+        "its material"
+        for part, ratio in different.items()
+    ]
 
 
 class _Stages:
@@ -337,23 +366,18 @@ def _trace_picture(scene: mi.Scene, camera: Camera, samples: int, seed: int) -> 
 
 
 def _fit_splats(
-    splats: Splats,
-    picture: PictureFunction,
-    cameras: Sequence[Camera],
-    samples: int,
-    settings: BakeSettings,
-    stages: _Stages,
+    splats: Splats, pictures: MeshPictures, cameras: Sequence[Camera], settings: BakeSettings, stages: _Stages
 ) -> Splats:
     """Fit splats to pictures of the mesh, which corrects their outlines most."""
-    pictures = []
+    targets = []
     for view, camera in enumerate(cameras):
         stages("rendering pictures", view / len(cameras))
-        colour, cover = picture(camera, samples, settings.seed + 1000 + view)
-        pictures.append(Picture(camera, encode_srgb(colour).astype(np.float32), cover.astype(np.float32)))
+        colour, cover = pictures.render(camera, pictures.fit_samples, settings.seed + 1000 + view)
+        targets.append(Picture(camera, encode_srgb(colour).astype(np.float32), cover.astype(np.float32)))
     stages("fitting to the pictures")
     return refine_splats(
         splats,
-        pictures,
+        targets,
         iterations=settings.fit_steps,
         seed=settings.seed,
         observe=lambda step, _: stages("fitting to the pictures", step / settings.fit_steps),

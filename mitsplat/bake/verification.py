@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -22,6 +23,21 @@ from mitsplat.renderer.layers import render_splats
 
 PictureFunction = Callable[[Camera, int, int], tuple[Float64Array, Float64Array]]
 """Function of a camera, the rays per pixel and a seed that returns a linear picture (H, W, 3) and coverage (H, W)."""
+
+
+class MeshPictures(NamedTuple):
+    """Pictures of a mesh, to which its Gaussians are fitted and with which they are compared.
+
+    Attributes:
+        render: Function that renders the mesh.
+        fit_samples, comparison_samples: Rays per pixel of the pictures for the fit and for the comparison.
+    """
+
+    render: PictureFunction
+    fit_samples: int
+    comparison_samples: int
+
+
 _SAMPLES_PER_PART = 4000
 _MAX_SIGMAS = 3.0
 """Distance to the next Gaussian, in its standard deviations, beyond which a point of the mesh counts as hidden."""
@@ -51,15 +67,14 @@ class BakedView:
 
 
 def compare_views(
-    picture: PictureFunction, splats: Splats, cameras: Sequence[Camera], samples: int, seed: int, progress: Progress
+    pictures: MeshPictures, splats: Splats, cameras: Sequence[Camera], seed: int, progress: Progress
 ) -> tuple[tuple[BakedView, ...], float, float]:
     """Compare the mesh and the splats in several views.
 
     Args:
-        picture: Function that renders the mesh.
+        pictures: Pictures of the mesh.
         splats: Splats of the mesh.
         cameras: The views.
-        samples: Rays per pixel of the pictures.
         seed: Seed of the pictures.
         progress: Progress callback.
 
@@ -69,7 +84,7 @@ def compare_views(
     views, errors, on_object = [], [], []
     for number, camera in enumerate(cameras):
         progress(number, len(cameras), "comparing with the mesh")
-        truth, cover = picture(camera, samples, seed + number)
+        truth, cover = pictures.render(camera, pictures.comparison_samples, seed + number)
         mesh, shown = (np.clip(encode_srgb(rgb), 0, 1) for rgb in (truth, render_splats(splats, camera).rgb))
         error = (shown - mesh) ** 2
         errors.append(error.mean())

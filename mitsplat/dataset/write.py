@@ -136,12 +136,7 @@ def write_dataset(
     """
     Scene.check(scene)
     out = path_of(out, "out")
-    count = scene.num_frames if frames is None else frames
-    check_whole_number(count, "frames")
-    if not 1 <= count <= scene.num_frames:
-        raise InputError(
-            f"frames must be between 1 and {scene.num_frames}, which is layouts x views of {scene.path} (got {count})"
-        )
+    count = _frame_count(scene, frames)
     check_workers(workers)
     catalogue = Catalogue.of(scene)
     indices = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
@@ -170,20 +165,14 @@ def write_dataset(
         if used_device.reason:
             note(f"device {used_device}: {used_device.reason}")
         if layouts:
-            if remove_folds(out):
-                _logger.warning(
-                    "%s: the lists of folds do not contain the new images and are removed: run `mitsplat split` again",
-                    out,
-                )
-            append_run(out, workers, used_device.kind, [gpu.name for gpu in used_device.gpus])
+            _begin_run(out, workers, used_device)
         incomplete = IncompleteLayouts(scene, -(-count // scene.spec.output.views))
         for layout in sorted({layout_index_of(scene, index) for index in indices}):
             incomplete.read(out / f"layouts/{layout:04d}.json")
         job = FrameJob(scene, catalogue, out, render or render_frame, settle or settle_layout)
+        num_missing = sum(map(len, layouts.values()))
         unsettled = [layout for layout in layouts if settle is not None or not is_cached(scene, layout)]
-        run_time = RunTime(
-            len(unsettled), sum(map(len, layouts.values())), settles_first=min(layouts, default=0) in unsettled
-        )
+        run_time = RunTime(len(unsettled), num_missing, settles_first=min(layouts, default=0) in unsettled)
         with closing(_results(job, layouts, workers, cluster, used_device, note)) as results:
             for record, seconds in results:
                 append_line(out / TIMINGS, {"index": record["index"], **seconds})
@@ -194,7 +183,31 @@ def write_dataset(
                 incomplete.add(record["layout"], [(one["name"], one["reason"]) for one in record.get("left_out", ())])
         counts = FrameCounts()
         finish_folder(out, manifest, content, catalogue, counts.add)
-        return counts.summary(out, rendered=sum(map(len, layouts.values())))
+        return counts.summary(out, rendered=num_missing)
+
+
+def _frame_count(scene: Scene, frames: int | None) -> int:
+    """Return the number of frames of a dataset, by default all of the scene.
+
+    Raises:
+        InputError: If the scene has fewer frames.
+    """
+    count = scene.num_frames if frames is None else frames
+    check_whole_number(count, "frames")
+    if not 1 <= count <= scene.num_frames:
+        raise InputError(
+            f"frames must be between 1 and {scene.num_frames}, which is layouts x views of {scene.path} (got {count})"
+        )
+    return count
+
+
+def _begin_run(out: Path, workers: int | None, device: Device) -> None:
+    """Record a run that adds images, and remove lists of folds, which do not contain them."""
+    if remove_folds(out):
+        _logger.warning(
+            "%s: the lists of folds do not contain the new images and are removed: run `mitsplat split` again", out
+        )
+    append_run(out, workers, device.kind, [gpu.name for gpu in device.gpus])
 
 
 def _results(

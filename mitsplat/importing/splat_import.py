@@ -245,19 +245,13 @@ def import_splats(
     cleaner, upright = _clean(path, loaded, kind, settings, report)
     if reason:
         upright = replace(upright, reason=reason)
-    turn = homogeneous_matrix(upright.rotation)
-    support = None
+    turn, support = homogeneous_matrix(upright.rotation), None
     if kind == "environment" and upright.support is not None:
         support, placed = _align_to_support(cleaner.splats.transformed(turn), upright.support)
         turn = placed @ turn
-    splats = cleaner.splats.transformed(turn)
     report("finding the surface")
     seen_below = kind == "object" and not settings.without_table
-    mesh = _surface(splats, kind, settings, lowest=-1.0 if seen_below else 0.0)
-    if mesh is not None and (settings.flat_base or (settings.without_table and _topples(mesh))):
-        mesh, height = _cut_base(path, mesh)
-        cleaner.remove("below the base", splats.means[:, 2] < height, "nothing is above its base")
-        splats = cleaner.splats.transformed(turn)
+    splats, mesh = _upright_surface(path, cleaner, turn, kind, settings, lowest=-1.0 if seen_below else 0.0)
     asset = Asset(
         name=name,
         class_name=class_name or name,
@@ -283,18 +277,39 @@ def import_splats(
         watertight=asset.mesh is not None and is_closed(asset.mesh),
         topples=kind == "object" and asset.mesh is not None and _topples(asset.mesh),
     )
-    if asset.mesh is not None:
-        report("comparing mesh and splats")
-        cameras = _cameras(asset.splats, kind, settings, _TEST_VIEWS, lowest=-0.3 if seen_below else 0.0, turn=0.7)
-        views = show_asset(asset.splats, asset.mesh, cameras)
-        offset = measure_offset(asset.mesh, surface_points(asset.splats, cameras)).shift
-        result = replace(result, views=views, offset=offset)
-    if asset.mesh is not None and kind == "object":
-        report("splitting the mesh into convex pieces")
-        asset = replace(asset, pieces=_pieces_of_parts(asset.mesh))
-        overlaps = [iou(view.alpha >= 0.5, view.mesh) for view in result.views]
-        result = replace(result, asset=asset, mesh_iou=float(np.mean(overlaps)))
-    return result
+    if asset.mesh is None:
+        return result
+    report("comparing mesh and splats")
+    result = _compare_mesh(result, asset.mesh, settings, lowest=-0.3 if seen_below else 0.0)
+    if kind == "environment":
+        return result
+    report("splitting the mesh into convex pieces")
+    return replace(result, asset=replace(asset, pieces=_pieces_of_parts(asset.mesh)))
+
+
+def _upright_surface(
+    path: Path, cleaner: _Cleaner, turn: Float64Array, kind: str, settings: ImportSettings, *, lowest: float
+) -> tuple[Splats, trimesh.Trimesh | None]:
+    """Return the upright splats and their surface, with a flat base if it is wanted or if the object would topple."""
+    splats = cleaner.splats.transformed(turn)
+    mesh = _surface(splats, kind, settings, lowest)
+    if mesh is not None and (settings.flat_base or (settings.without_table and _topples(mesh))):
+        mesh, height = _cut_base(path, mesh)
+        cleaner.remove("below the base", splats.means[:, 2] < height, "nothing is above its base")
+        splats = cleaner.splats.transformed(turn)
+    return splats, mesh
+
+
+def _compare_mesh(result: Imported, mesh: trimesh.Trimesh, settings: ImportSettings, *, lowest: float) -> Imported:
+    """Return the result with pictures of splats and mesh, and their offset; for an object also their overlap."""
+    asset = result.asset
+    cameras = _cameras(asset.splats, asset.kind, settings, _TEST_VIEWS, lowest=lowest, turn=0.7)
+    views = show_asset(asset.splats, mesh, cameras)
+    offset = measure_offset(mesh, surface_points(asset.splats, cameras)).shift
+    result = replace(result, views=views, offset=offset)
+    if asset.kind != "object":
+        return result
+    return replace(result, mesh_iou=float(np.mean([iou(view.alpha >= 0.5, view.mesh) for view in views])))
 
 
 def _clean(

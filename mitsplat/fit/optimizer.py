@@ -27,6 +27,9 @@ from mitsplat.renderer.rays.camera_rays import Kind
 from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
 from mitsplat.runtime.recorded_kernels import recorded
 
+QUALITY = Quality(transmittance_min=1e-3)
+"""Cut-offs of renderings during a fit."""
+
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-15
 """Constants of Adam as in 3DGS. mi.ad.Adam is not used: it loses all moments when the number of Gaussians changes."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -39,7 +39,7 @@ def photo_gradients(
     photo: tuple[mi.UInt32, mi.Bool | None],
     numbers: mi.Float,
     constants: LossConstants,
-) -> tuple[dict[str, Any], mi.Float]:
+) -> tuple[list[mi.Float], mi.Float, mi.Float | None, mi.Float]:
     """Return the gradients of the loss of one photo, and the mean squared error of its pixels.
 
     Args:
@@ -51,15 +51,14 @@ def photo_gradients(
         constants: Constants of the loss.
 
     Returns:
-        Gradients of ``rgb``, ``alpha``, and of ``moment`` if it exists; and the error.
+        Gradients of colours, opacity, and depth moment, None without ``depth``; and the error.
     """
-    inputs: dict[str, Any] = {"rgb": [mi.Float(c) for c in rgb], "alpha": mi.Float(alpha)}
+    colours, opacity = [mi.Float(c) for c in rgb], mi.Float(alpha)
+    moment = None if depth is None else mi.Float(depth[0])
+    dr.enable_grad(colours, opacity, moment)
+    rgb, alpha, loss = colours, opacity, mi.Float(0)
     if depth is not None:
-        inputs["moment"] = mi.Float(depth[0])
-    dr.enable_grad(inputs)
-    rgb, alpha, loss = inputs["rgb"], inputs["alpha"], mi.Float(0)
-    if depth is not None:
-        loss += number(numbers, 3) * number(numbers, 4) * depth_error(alpha, inputs["moment"], depth[1])
+        loss += number(numbers, 3) * number(numbers, 4) * depth_error(alpha, moment, depth[1])
     target, mask = unpacked(photo[0])
     if constants.background:
         behind = [number(numbers, channel) for channel in range(3)]
@@ -73,7 +72,7 @@ def photo_gradients(
         loss += constants.alpha_weight * dr.mean(dr.abs(alpha - mask))
     error = dr.mean(sum(dr.square(dr.detach(c) - t) for c, t in zip(rgb, target, strict=True))) / 3
     dr.backward(loss)
-    return {name: dr.grad(value) for name, value in inputs.items()}, error
+    return [dr.grad(c) for c in colours], dr.grad(opacity), None if moment is None else dr.grad(moment), error
 
 
 def depth_image(camera: Camera, pixel: mi.UInt32, inverse: mi.Float) -> mi.Float:

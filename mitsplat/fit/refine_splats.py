@@ -11,10 +11,9 @@ import numpy as np
 
 from mitsplat.arrays import Float32Array
 from mitsplat.fit.image_metrics import psnr_of
-from mitsplat.fit.optimizer import GaussianModel
+from mitsplat.fit.optimizer import QUALITY, GaussianModel
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
-from mitsplat.quality import Quality
 from mitsplat.renderer.differentiation.backward import Eye
 from mitsplat.renderer.layers import make_sensor
 from mitsplat.renderer.rays.device_arrays import number, on_device, wrapped
@@ -38,7 +37,6 @@ class Picture:
     alpha: Float32Array
 
 
-QUALITY = Quality(transmittance_min=1e-3)
 _RATES = {"means": 0.02, "quats": 0.004, "scales": 0.01, "opacities": 0.05, "sh": 0.01}
 """Initial learning rates per step: of the means, as a share of the mean scale of the splats; of the quaternions'
 components, the logarithms of the scales, the logits of the opacities, and the constant SH coefficients.

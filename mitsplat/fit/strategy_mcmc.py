@@ -52,7 +52,7 @@ class Densification(Protocol):
         """Change the Gaussians after a step.
 
         Args:
-            model: The Gaussians.
+            model: The Gaussians; changed in place.
             step: Number of finished steps.
             fraction: Share of the fit's schedule before this step.
             rate: Learning rate of the means.
@@ -83,15 +83,7 @@ class Mcmc:
         """Do nothing, because MCMC depends only on opacities."""
 
     def refine(self, model: GaussianModel, step: int, fraction: float, rate: float, rng: np.random.Generator) -> None:
-        """Relocate dead Gaussians and add new ones at intervals, and add noise in every step.
-
-        Args:
-            model: The Gaussians; changed in place.
-            step: Number of the step.
-            fraction: Completed fraction of the fit.
-            rate: Learning rate of the means.
-            rng: Random numbers of the relocation.
-        """
+        """Relocate dead Gaussians and add new ones at intervals, and add noise in every step."""
         if _ACTIVE_RANGE[0] <= fraction < _ACTIVE_RANGE[1] and step % self._every == 0:
             relocate(model, rng)
             grow(model, self._target_count(model.count, fraction), rng)

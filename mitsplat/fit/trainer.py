@@ -25,7 +25,7 @@ from mitsplat.fit.depth_priors import DepthMap, DepthMaps, align_maps, crop_map
 from mitsplat.fit.fit_folder import FitFolder, FitResult
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.fit.initial_points import seed_points
-from mitsplat.fit.optimizer import Adam, GaussianModel
+from mitsplat.fit.optimizer import QUALITY, Adam, GaussianModel
 from mitsplat.fit.photo_loss import LossConstants, depth_image, photo_gradients
 from mitsplat.fit.strategy_mcmc import Densification, Mcmc, seed_splats
 from mitsplat.fit.training_view import HeldOut, TrainingView
@@ -136,7 +136,6 @@ class FitProgress:
     gaussians: int
 
 
-QUALITY = Quality(transmittance_min=1e-3)
 _REPORT_STEPS = 25
 """Steps between reports; reading a loss waits for the device."""
 _MAX_READERS = 16
@@ -208,30 +207,35 @@ def fit_capture(
         fit.restore(state)
     held = [_training_view(photo, settings) for photo in held_out]
     folder.start(resumed=state is not None)
-    saved = time.monotonic()
-    while fit.fraction < 1:
-        fit.step()
-        if fit.steps % _REPORT_STEPS == 0 or fit.fraction >= 1:
-            now = fit.report()
-            if progress is not None:
-                progress(now)
-            if settings.target_psnr is not None and (now.validation or 0) >= settings.target_psnr:
-                break
-            if time.monotonic() - saved > _CHECKPOINT_SECONDS:
-                folder.save_checkpoint(fit.state())
-                saved = time.monotonic()
-    seconds = fit.elapsed
+    _run_steps(fit, folder, progress)
     result = FitResult(
-        fit.model.splats(),
-        fit.steps,
-        seconds,
-        fit.evaluate(held, folder.held_out),
-        folder.inputs,
-        warnings,
-        fit.evaluate(fit.validation, None),
+        splats=fit.model.splats(),
+        iterations=fit.steps,
+        seconds=fit.elapsed,
+        held_out=fit.evaluate(held, folder.held_out),
+        inputs=folder.inputs,
+        warnings=warnings,
+        validation=fit.evaluate(fit.validation, None),
     )
     folder.save(result, {"units": capture.units, "variant": mi.variant(), "settings": asdict(settings)})
     return result
+
+
+def _run_steps(fit: _Fit, folder: FitFolder, progress: Callable[[FitProgress], None] | None) -> None:
+    """Make the steps that are left, up to the end of the schedule or the target PSNR, and write checkpoints."""
+    saved, target = time.monotonic(), fit.settings.target_psnr
+    while fit.fraction < 1:
+        fit.step()
+        if fit.steps % _REPORT_STEPS and fit.fraction < 1:
+            continue
+        now = fit.report()
+        if progress is not None:
+            progress(now)
+        if target is not None and (now.validation or 0) >= target:
+            return
+        if time.monotonic() - saved > _CHECKPOINT_SECONDS:
+            folder.save_checkpoint(fit.state())
+            saved = time.monotonic()
 
 
 class _Fit:
@@ -338,10 +342,12 @@ class _Fit:
             background=s.background == "random",
         )
         depth = (seen.moment, depth_image(view.camera, pixel, inverse)) if isinstance(seen, DepthRendering) else None
-        gradient, error = photo_gradients(seen.rgb, seen.alpha, depth, (view.packed, view.hidden), numbers, constants)
-        records = [seen.gradient(gradient["rgb"], gradient["alpha"])]
+        rgb, alpha, moment, error = photo_gradients(
+            seen.rgb, seen.alpha, depth, (view.packed, view.hidden), numbers, constants
+        )
+        records = [seen.gradient(rgb, alpha)]
         if isinstance(seen, DepthRendering):
-            records.append(seen.gradient_of_moment(gradient["moment"]))
+            records.append(seen.gradient_of_moment(moment))
         count = self.model.count
         self.model.set_gradients(
             view.eye,

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsplat.fit.refine_splats import QUALITY, Picture, refine_splats
+from mitsplat.fit.optimizer import QUALITY
+from mitsplat.fit.refine_splats import Picture, refine_splats
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb

@@ -9,8 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.fit.refine_splats import QUALITY
+from mitsplat.fit.optimizer import QUALITY, GaussianModel
 from mitsplat.fit.strategy_mcmc import grow, jitter, relocate, seed_splats, split_opacity
 from mitsplat.renderer.layers import make_sensor, render_splats
 from mitsplat.runtime.variant import ensure_variant

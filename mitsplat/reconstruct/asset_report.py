@@ -22,7 +22,7 @@ from mitsplat.pages.html import (
     write_report_page,
 )
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, take_evenly
-from mitsplat.reconstruct.causes import views_from
+from mitsplat.reconstruct.causes import elevations, views_from
 from mitsplat.reconstruct.reconstruct import Reconstruction
 
 PHOTOS = 24
@@ -113,15 +113,15 @@ def _cameras(capture: Capture) -> str:
     middle = np.median(centres, axis=0)
     span = 1.3 * float(np.abs(centres - middle).max()) or 1.0
     near = (np.abs(points - middle) < span).all(axis=1)
+    scale = min(_PLOT_WIDTH, _PLOT_HEIGHT) / (2 * span)
     views = {
         "from the side": np.array([[1.0, 0, 0], [0, 0.26, -0.97]]),
         "from above": np.array([[1.0, 0, 0], [0, -1.0, 0]]),
     }
     figures = []
     for caption, axes in views.items():
-        scale = min(_PLOT_WIDTH, _PLOT_HEIGHT) / (2 * span)
 
-        def at(positions: Float64Array, axes: Float64Array = axes, scale: float = scale) -> Float64Array:
+        def at(positions: Float64Array, axes: Float64Array = axes) -> Float64Array:
             return np.asarray((positions - middle) @ axes.T * scale + (_PLOT_WIDTH / 2, _PLOT_HEIGHT / 2))
 
         dots = "".join(
@@ -142,7 +142,7 @@ def _cameras(capture: Capture) -> str:
 def _directions(capture: Capture) -> str:
     """Return a polar drawing of the view directions: the zenith in the middle, the horizon as a circle around it."""
     offsets = views_from([photo.camera for photo in capture.photos])
-    heights = np.degrees(np.arctan2(offsets[:, 2], np.linalg.norm(offsets[:, :2], axis=1)))
+    heights = elevations(offsets)
     middle, reach = (_PLOT_WIDTH / 2, _PLOT_HEIGHT / 2), _PLOT_HEIGHT / 2 - 30
     rings = "".join(
         f'<circle cx="{middle[0]}" cy="{middle[1]}" r="{radius:.1f}" fill="none" stroke="#999"/>'

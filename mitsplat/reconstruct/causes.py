@@ -110,9 +110,14 @@ def views_from(cameras: Sequence[Camera]) -> Float64Array:
     return np.asarray(centres - nearest_point_to_lines(centres, axes))
 
 
+def elevations(offsets: Float64Array) -> Float64Array:
+    """Return the elevations (N,) above the horizon [degrees] of vectors (N, 3), z up."""
+    return np.asarray(np.degrees(np.arctan2(offsets[:, 2], np.linalg.norm(offsets[:, :2], axis=1))))
+
+
 def missing_views(offsets: Float64Array) -> list[str]:
     """Describe directions without a camera, for cameras at ``offsets`` (N, 3) from an object, z up."""
-    heights = np.degrees(np.arctan2(offsets[:, 2], np.linalg.norm(offsets[:, :2], axis=1)))
+    heights = elevations(offsets)
     turns = np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0])) % 360
     sectors = round(360 / _SECTOR)
     found = []

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import drjit as dr
@@ -147,8 +146,7 @@ def reconstruct_surface(
     # An outside border closes the surface at the edge of the grid.
     padded, known = np.pad(distance, 1, constant_values=-grid.truncation), np.pad(known, 1, constant_values=masked)
     try:
-        triangulate: Any = marching_cubes
-        vertices, faces, _, _ = triangulate(padded, 0.0, gradient_direction="ascent", mask=known)
+        vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="ascent", mask=known)  # type: ignore[no-untyped-call]
     except (ValueError, RuntimeError):
         raise InputError(
             "no surface lies inside the masks of all views: do masks, cameras and splats belong together?"
@@ -252,10 +250,12 @@ class _Grid:
 
     @property
     def count(self) -> int:
+        """Number of cells."""
         return int(np.prod(self.shape))
 
     @classmethod
     def around(cls, splats: Splats, settings: SurfaceSettings) -> _Grid:
+        """Return a grid around the bulk of the splats."""
         low, high = np.quantile(splats.means.astype(np.float64), (_BOUNDS_QUANTILE, 1 - _BOUNDS_QUANTILE), axis=0)
         margin = _MARGIN * float((high - low).max()) + 2 * float(np.median(splats.scales.max(axis=1)))
         low, high = low - margin, high + margin
@@ -268,6 +268,7 @@ class _Grid:
         return np.asarray(self.low[2] + self.cell * (np.arange(self.shape[2]) + 0.5), dtype=np.float32)
 
     def start(self, silhouettes: int) -> _State:
+        """Return the initial state, which keeps the smallest ``silhouettes`` distances to silhouettes of a cell."""
         ensure_variant()
         nothing = dr.zeros(mi.Float, self.count)
         return _State([dr.full(mi.Float, _FAR, self.count) for _ in range(silhouettes)], *[nothing] * 4)
@@ -335,10 +336,8 @@ class _Grid:
     def thin_cells(self, splats: Splats, distance: Float32Array, state: _State) -> BoolArray:
         """Return True for cells that Gaussians fill inside all silhouettes but outside any surface.
 
-        Neighbours of these cells are included.
-
-            A Gaussian of opacity a and standard deviations s, t blocks light on an area of 2 pi a s t. Random points
-            distribute this area over cells.
+        Neighbours of these cells are included. A Gaussian of opacity a and standard deviations s, t blocks light on an
+        area of 2 pi a s t. Random points distribute this area over cells.
         """
         ordered = np.sort(splats.scales.astype(np.float64), axis=1)
         area = 2 * np.pi * splats.opacities * ordered[:, 1] * ordered[:, 2] / self.cell**2

@@ -45,6 +45,8 @@ _MIN_SHARE = 0.03
 """Share of the points below which a cluster is merged with another."""
 _NEIGHBOURS = 12
 """Number of points over which colours and errors are averaged."""
+_PHOTO_SIZE = 640
+"""Longest edge of the photos [px]."""
 _MIN_VIEWS = 4
 
 
@@ -122,27 +124,22 @@ class MaterialEstimate:
         return replace(splats, sh=((colours[:, None] - 0.5) / SH_C0).astype(np.float32), materials=materials)
 
 
-def estimate_materials(
-    capture: Capture, mesh: trimesh.Trimesh, light: CaptureLight, *, size: int = 640, seed: int = 0
-) -> MaterialEstimate:
+def estimate_materials(capture: Capture, mesh: trimesh.Trimesh, light: CaptureLight) -> MaterialEstimate:
     """Estimate the materials of an object from its photographs.
 
     Args:
         capture: Photos with masks, in metres, z up.
         mesh: Surface of the object in the frame of the capture.
         light: Light of the photographs.
-        size: Longest edge of the photos [px].
-        seed: Seed of the surface points and the rays.
 
     Raises:
         InputError: If the capture has no metric frame, or too few photos show the object.
     """
     ensure_variant()
     require_light_frame(capture)
-    views = [View.of(photo, size) for photo in capture.photos if photo.mask is not None]
-    surfaces = lit_surfaces(mesh, views, light, floor=0.0 if capture.table else float(mesh.bounds[0, 2]), seed=seed)
-    rng = np.random.default_rng(seed)
-    points, normals = sample_surface(mesh, _POINTS, seed)
+    views = [View.of(photo, _PHOTO_SIZE) for photo in capture.photos if photo.mask is not None]
+    surfaces = lit_surfaces(mesh, views, light, floor=0.0 if capture.table else float(mesh.bounds[0, 2]))
+    points, normals = sample_surface(mesh, _POINTS)
     seen = observe(surfaces, points, normals, views, "object")
     counts = np.bincount(seen.point, minlength=len(points))
     usable = np.flatnonzero(counts >= _MIN_VIEWS)
@@ -151,16 +148,18 @@ def estimate_materials(
             f"materials need surface points that {_MIN_VIEWS} photos show (got {len(usable)}): check masks and light"
         )
     points, normals, (seen, _) = points[usable], normals[usable], seen.select(usable)
-    clear = clear_points(mesh, surfaces, points, normals, views, seed)
-    fitted = np.sort(rng.permutation(len(points))[:_FIT_POINTS])
+    clear = clear_points(mesh, surfaces, points, normals, views)
+    # Errors of a part of the points for each metalness and roughness of the grid.
+    fitted = np.sort(np.random.default_rng(0).permutation(len(points))[:_FIT_POINTS])
     observed, _ = seen.select(fitted)
-    traced = _trace(surfaces, points[fitted], normals[fitted], observed, _ROUGHNESS, seed)
+    traced = _trace(surfaces, points[fitted], normals[fitted], observed, _ROUGHNESS)
     fits = [[fit_colours(observed, mix_materials(traced, m, k)) for k in range(len(_ROUGHNESS))] for m in _METALLIC]
     errors = np.stack([np.stack([fit.errors for fit in row], axis=1) for row in fits], axis=1)
 
     def reflected(metallic: float, roughness: float) -> tuple[Float64Array, Float64Array]:
-        return mix_materials(_trace(surfaces, points, normals, seen, np.array([roughness]), seed), metallic, 0)
+        return mix_materials(_trace(surfaces, points, normals, seen, np.array([roughness])), metallic, 0)
 
+    # Clusters of points of similar base colour, and the material of each region of clusters.
     best = np.unravel_index(errors.mean(axis=0).argmin(), errors.shape[1:])
     fit = fit_colours(seen, reflected(float(_METALLIC[best[0]]), float(_ROUGHNESS[best[1]])))
     near = KDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))[1]
@@ -213,10 +212,9 @@ def _trace(
     normals: Float64Array,
     seen: Observations,
     roughness: Float64Array,
-    seed: int,
 ) -> Reflectance:
     light = surfaces.light(points, normals)
-    return surfaces.reflectance(light, seen.point, seen.to_camera, roughness.tolist(), seed)
+    return surfaces.reflectance(light, seen.point, seen.to_camera, roughness.tolist())
 
 
 def _members(cluster: Int64Array, number: int, clear: BoolArray) -> Int64Array:

@@ -31,7 +31,7 @@ _OUTER = 20
 """Number of nearest photographed points that determine the base colour of a point outside the photographs."""
 
 
-def lit_surfaces(mesh: trimesh.Trimesh, views: Sequence[View], light: CaptureLight, floor: float, seed: int) -> LitMesh:
+def lit_surfaces(mesh: trimesh.Trimesh, views: Sequence[View], light: CaptureLight, floor: float) -> LitMesh:
     """Return the object with its radiance in the photos, and its support, a plane at height ``floor``."""
     fine = trimesh.Trimesh(mesh.vertices, mesh.faces).subdivide_to_size(float(mesh.scale) / 25, max_iter=20)
     plane = _plane(mesh, floor)
@@ -45,7 +45,7 @@ def lit_surfaces(mesh: trimesh.Trimesh, views: Sequence[View], light: CaptureLig
     radiance = np.zeros((len(whole.vertices), 4, 3))
     radiance[: len(fine.vertices)] = _linear_radiance(fine.vertices, photographed)
     surfaces.set_radiance(radiance)
-    radiance[len(fine.vertices) :] = _support_radiance(surfaces, plane.vertices, views, mesh, seed)
+    radiance[len(fine.vertices) :] = _support_radiance(surfaces, plane.vertices, views, mesh)
     surfaces.set_radiance(radiance)
     return surfaces
 
@@ -66,7 +66,7 @@ def _plane(mesh: trimesh.Trimesh, floor: float) -> trimesh.Trimesh:
 
 
 def _support_radiance(
-    surfaces: LitMesh, points: Float64Array, views: Sequence[View], mesh: trimesh.Trimesh, seed: int
+    surfaces: LitMesh, points: Float64Array, views: Sequence[View], mesh: trimesh.Trimesh
 ) -> Float64Array:
     """Return the radiance of points (N, 3) of the support towards the object, as coefficients (N, 4, 3).
 
@@ -78,7 +78,7 @@ def _support_radiance(
     if not len(known):
         return np.zeros((len(points), 4, 3))
     light = surfaces.light(points, upward)
-    traced = surfaces.reflectance(light, seen.point, seen.to_camera, _ROUGHNESS, seed)
+    traced = surfaces.reflectance(light, seen.point, seen.to_camera, _ROUGHNESS)
     # Clipped pixels count as just below the limit, because a support that is clipped everywhere must not become black.
     observed = Observations(row, np.minimum(seen.radiance, 0.999 * CLIPPED), seen.to_camera)
     fits = [fit_colours(observed, mix_materials(traced, 0.0, k)) for k in range(len(_ROUGHNESS))]
@@ -86,12 +86,12 @@ def _support_radiance(
     nearest = KDTree(points[known]).query(points, k=min(_OUTER, len(known)))[1].reshape(len(points), -1)
     colours = np.median(fits[best].colours[nearest], axis=1)
     colours[known] = fits[best].colours
-    targets, normals = sample_surface(mesh, _TARGETS, seed)
+    targets, normals = sample_surface(mesh, _TARGETS)
     towards = targets - points[:, None]
     towards /= np.maximum(np.linalg.norm(towards, axis=2, keepdims=True), 1e-12)
     point, target = np.nonzero((np.einsum("ntd,td->nt", towards, normals) < 0) & (towards[..., 2] > 1e-3))
     towards = towards[point, target]
-    traced = surfaces.reflectance(light, point, towards, _ROUGHNESS[best : best + 1], seed)
+    traced = surfaces.reflectance(light, point, towards, _ROUGHNESS[best : best + 1])
     tint, white = mix_materials(traced, 0.0, 0)
     radiance = colours[point] * tint + white
     # Photographs contain the light that the object reflects onto the support, and the model the grazing angles.

@@ -75,7 +75,7 @@ class Observations(NamedTuple):
         return Observations(np.searchsorted(points, self.point[rows]), self.radiance[rows], self.to_camera[rows]), rows
 
 
-def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Float64Array, Float64Array]:
+def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int = 0) -> tuple[Float64Array, Float64Array]:
     """Return random points (N, 3) on a mesh and their smooth unit normals (N, 3)."""
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
     points = np.asarray(points)
@@ -118,12 +118,11 @@ def clear_points(
     points: Float64Array,
     normals: Float64Array,
     views: Sequence[View],
-    seed: int,
 ) -> BoolArray:
     """Return True for points (N,) that mirror little of the object itself, and that are flat within two pixels."""
     camera = views[0].camera
     pixel = float(np.linalg.norm(camera.centre - mesh.bounds.mean(axis=0))) / camera.fx
-    others, their_normals = sample_surface(mesh, 10 * len(points), seed + 1)
+    others, their_normals = sample_surface(mesh, 10 * len(points), seed=1)
     near = KDTree(others).query_ball_point(points, 2 * pixel)
     flatness = np.array([normals[i] @ their_normals[rows].mean(axis=0) if rows else 1 for i, rows in enumerate(near)])
     clear = (flatness > _MIN_FLATNESS) & (surfaces.openness(points, normals) > _MIN_OPENNESS)

@@ -129,7 +129,7 @@ class LitMesh:
         return light
 
     def reflectance(
-        self, light: IncidentLight, row: Int64Array, to_camera: Float64Array, roughness: Sequence[float], seed: int
+        self, light: IncidentLight, row: Int64Array, to_camera: Float64Array, roughness: Sequence[float]
     ) -> Reflectance:
         """Return the light that points reflect towards cameras.
 
@@ -141,7 +141,6 @@ class LitMesh:
             row: Index of the point of each ray, shape (R,).
             to_camera: Unit vectors towards the cameras, (R, 3).
             roughness: Values of roughness, K numbers.
-            seed: Seed of the rays.
         """
         count, rays = len(roughness), len(row)
         item = dr.arange(mi.UInt32, rays * count)
@@ -154,7 +153,7 @@ class LitMesh:
         plastic, si = replace(metal, metallic=mi.Float(0)), receiver(dr.gather(mi.Point3f, light.points, place), normal)
         lobe_samples, lights = dr.opaque(mi.UInt32, _LOBE_LATTICE[0]), dr.opaque(mi.UInt32, _LIGHT_LATTICE[0])
         share = dr.opaque(mi.Float, _LIGHT_LATTICE[0] / _LOBE_LATTICE[0])
-        first = mi.sample_tea_32(item, dr.opaque(mi.UInt32, seed))
+        first = mi.sample_tea_32(item, dr.opaque(mi.UInt32, 0))
         shift = mi.Point2f(*[mi.Float(value >> 8) * 2.0**-24 for value in first])
 
         def added(sums: Sequence[mi.Color3f], radiance: mi.Color3f, cos_half: mi.Float) -> list[mi.Color3f]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,10 +15,9 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.capture.capture import Capture, Photo
+from mitsplat.capture.capture import Capture
 from mitsplat.fit.image_metrics import psnr
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.geometry.triangulation import nearest_point_to_lines
 from mitsplat.pages.html import make_section, rgb_image
@@ -57,6 +56,33 @@ _MIN_REGION = 0.1
 _UP = np.array([0.0, 0.0, 1.0])
 
 
+@dataclass(frozen=True, eq=False)
+class _PhotographedPlace:
+    """Photographed place, with all parts in one frame.
+
+    Attributes:
+        capture: Photos with cameras.
+        splats: Splats of the place.
+        views: Depth of the splats from the cameras of the training photos.
+        points: Points on the surfaces in these views.
+        scale: Typical depth of the photos.
+        supports: Level surfaces; the origin is on the first.
+    """
+
+    capture: Capture
+    splats: Splats
+    views: Sequence[DepthView]
+    points: SurfacePoints
+    scale: float
+    supports: Sequence[Support] = ()
+
+    @classmethod
+    def of(cls, capture: Capture, splats: Splats, scale: float, supports: Sequence[Support] = ()) -> _PhotographedPlace:
+        """Render the depth views of splats, and return the place."""
+        views = depth_views(splats, [photo.camera for photo in capture.training])
+        return cls(capture, splats, views, surface_points(views), scale, supports)
+
+
 def reconstruct_environment(
     capture: Capture,
     splats: Splats,
@@ -81,39 +107,29 @@ def reconstruct_environment(
     """
     if progress is not None:
         progress(0, 1, "removing floaters and finding supports")
-    cameras = [photo.camera for photo in capture.training]
     scale = _typical_depth(capture)
     splats, removed = remove_floaters(splats, capture.training, scale)
-    views = depth_views(splats, cameras)
-    points = surface_points(views)
-    found = _find_supports(points, scale, vertical_known=capture.up != "unknown")
-    motion: Float64Array = np.eye(4)
-    if found:
-        motion = np.asarray(np.linalg.inv(found[0].pose))
-        capture, splats = replace(capture.transformed(motion), up="z", table=True), splats.transformed(motion)
-        points, views = points.transformed(motion), [view.transformed(motion) for view in views]
-        found = find_supports(points, _UP, scale, within=_MAX_LEVEL_TILT)
-    cameras = [photo.camera for photo in capture.training]
-    fitted, removed_objects = splats, list[RemovedObject]()
+    place, motion = _level_place(capture, splats, scale)
+    fitted, removed_objects = place.splats, list[RemovedObject]()
     if job.remove:
-        splats, removed_objects = remove_objects(splats, job.remove, capture, found, points, scale, progress)
-        views = depth_views(splats, cameras)
-        points = surface_points(views)
-    background = _background(splats, cameras)
-    imported = job.imported
-    if imported is None:
-        mesh = _mesh(splats.select(~background), capture.training, job, found, scale, progress)
-        imported = ImportedMesh(mesh, np.eye(4))
-    made = reconstruct_asset(capture, splats, replace(job, imported=imported, remove=()), psnr=psnr, progress=progress)
+        splats, removed_objects = remove_objects(
+            fitted, job.remove, place.capture, place.supports, place.points, scale, progress
+        )
+        place = _PhotographedPlace.of(place.capture, splats, scale, place.supports)
+    background = _background(place)
+    imported = job.imported or ImportedMesh(_mesh(place, ~background, job, progress), np.eye(4))
+    made = reconstruct_asset(
+        place.capture, place.splats, replace(job, imported=imported, remove=()), psnr=psnr, progress=progress
+    )
     made, larger = _without_rotation(made, motion)
     rows = {
-        "Frame": _frame_text(made.asset.units, capture.scale_error, source),
+        "Frame": _frame_text(made.asset.units, place.capture.scale_error, source),
         "Removed Gaussians": ", ".join(f"{count} {reason}" for reason, count in removed.items()),
         "Background": f"{int(background.sum())} Gaussians far behind the focus of the cameras, which are kept",
     }
     findings, sections, record = list[str](), list[str](), dict[str, object]()
-    if found:
-        surfaces = _describe_surfaces(capture, splats, found, views, points, scale, removed_objects, made.asset, larger)
+    if place.supports:
+        surfaces = _describe_surfaces(place, removed_objects, made.asset, larger)
         rows |= surfaces.rows
         findings += surfaces.findings
         sections.append(surfaces.map)
@@ -152,36 +168,23 @@ class _Surfaces(NamedTuple):
 
 
 def _describe_surfaces(
-    capture: Capture,
-    splats: Splats,
-    found: Sequence[Support],
-    views: Sequence[DepthView],
-    points: SurfacePoints,
-    scale: float,
-    removed: Sequence[RemovedObject],
-    asset: Asset,
-    larger: Float64Array,
+    place: _PhotographedPlace, removed: Sequence[RemovedObject], asset: Asset, larger: Float64Array
 ) -> _Surfaces:
     """Measure how the photos cover the first surface, and describe all.
 
     Args:
-        capture: Photos with cameras, in the frame of the first surface.
-        splats: Splats in the same frame, without removed objects.
-        found: Level surfaces in the same frame, at least one.
-        views: Depth maps of the training cameras.
-        points: Points of these maps.
-        scale: Typical depth of the photos.
+        place: The place without removed objects, with at least one support.
         removed: Objects that were removed from surfaces.
         asset: The environment.
-        larger: Transform (4, 4) from that frame to the asset's, without a rotation.
+        larger: Transform (4, 4) from the frame of the place to the asset's, without a rotation.
     """
-    factor, metric = float(larger[0, 0]), asset.units == "metre"
-    coverage = find_coverage(found[0], views, points, scale)
-    named = [(photo.name, photo.camera) for photo in capture.training]
-    holes = find_holes(found[0], coverage, splats, named)
-    supports = [support.transformed(larger) for support in found]
+    factor, metric, first = float(larger[0, 0]), asset.units == "metre", place.supports[0]
+    coverage = find_coverage(first, place.views, place.points, place.scale)
+    named = [(photo.name, photo.camera) for photo in place.capture.training]
+    holes = find_holes(first, coverage, place.splats, named)
+    supports = [support.transformed(larger) for support in place.supports]
     filled = coverage.cells_with(np.concatenate([np.zeros((0, 2)), *(t.filled for t in removed if t.support == 0)]))
-    region = _region(coverage, found[0], factor)
+    region = _region(coverage, factor)
     unit = "m" if metric else "units"
     rows = _rows(supports, coverage, holes, region, factor, unit)
     record: JsonObject = {}
@@ -201,10 +204,32 @@ def _describe_surfaces(
         {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
     ]
     if region is not None and metric:
-        seen = [photo.camera for photo in capture.transformed(larger).photos]
+        seen = [photo.camera for photo in place.capture.transformed(larger).photos]
         record["scene"] = scene_text(asset.name, supports, region, seen)
     findings = _findings(coverage, holes, region, factor, unit, metric=metric)
     return _Surfaces(rows, findings, _support_map(coverage, filled), record)
+
+
+def _level_place(capture: Capture, splats: Splats, scale: float) -> tuple[_PhotographedPlace, Float64Array]:
+    """Return the place with its main support in z = 0, and the transform (4, 4) from the capture's frame to it.
+
+    Without a support, the place stays in the capture's frame.
+    """
+    place = _PhotographedPlace.of(capture, splats, scale)
+    found = _find_supports(place.points, scale, vertical_known=capture.up != "unknown")
+    if not found:
+        return place, np.eye(4)
+    motion = np.asarray(np.linalg.inv(found[0].pose))
+    points = place.points.transformed(motion)
+    level = _PhotographedPlace(
+        capture=replace(capture.transformed(motion), up="z", table=True),
+        splats=splats.transformed(motion),
+        views=[view.transformed(motion) for view in place.views],
+        points=points,
+        scale=scale,
+        supports=find_supports(points, _UP, scale, within=_MAX_LEVEL_TILT),
+    )
+    return level, motion
 
 
 def _find_supports(points: SurfacePoints, scale: float, *, vertical_known: bool) -> list[Support]:
@@ -236,28 +261,23 @@ def _typical_depth(capture: Capture) -> float:
     return float(np.median(known)) if known else 1.0
 
 
-def _background(splats: Splats, cameras: Sequence[Camera]) -> BoolArray:
+def _background(place: _PhotographedPlace) -> BoolArray:
     """Return True for Gaussians (N,) in the background."""
+    cameras = [photo.camera for photo in place.capture.training]
     centres = np.array([camera.centre for camera in cameras])
     focus = nearest_point_to_lines(centres, np.array([camera.world_from_camera[:3, 2] for camera in cameras]))
     away = float(np.quantile(np.linalg.norm(centres - focus, axis=1), 0.9))
-    return np.asarray(np.linalg.norm(splats.means - focus, axis=1) > _FOREGROUND_DISTANCE * away)
+    return np.asarray(np.linalg.norm(place.splats.means - focus, axis=1) > _FOREGROUND_DISTANCE * away)
 
 
-def _mesh(
-    splats: Splats,
-    photos: Sequence[Photo],
-    job: AssetJob,
-    supports: Sequence[Support],
-    scale: float,
-    progress: Progress | None,
-) -> trimesh.Trimesh:
-    cameras = [photo.camera.fitted(job.settings.view_size) for photo in photos]
-    mesh = reconstruct_surface(splats, cameras, settings=job.settings.surface, progress=progress)
-    return flatten_mesh(mesh, supports, _FLATTEN_RANGE * scale)
+def _mesh(place: _PhotographedPlace, shown: BoolArray, job: AssetJob, progress: Progress | None) -> trimesh.Trimesh:
+    """Return the surface of the Gaussians in ``shown`` (N,), with flat supports."""
+    cameras = [photo.camera.fitted(job.settings.view_size) for photo in place.capture.training]
+    mesh = reconstruct_surface(place.splats.select(shown), cameras, settings=job.settings.surface, progress=progress)
+    return flatten_mesh(mesh, place.supports, _FLATTEN_RANGE * place.scale)
 
 
-def _region(coverage: Coverage, support: Support, factor: float) -> Rectangle | None:
+def _region(coverage: Coverage, factor: float) -> Rectangle | None:
     """Return the largest free rectangle of the support in its frame [m or units]."""
     cells = free_rectangle(coverage.free)
     if cells is None:

@@ -86,6 +86,6 @@ def find_unsupported(splats: Splats, views: Sequence[DepthView], near: float) ->
         seen_through += depth < surface - room
         confirmed += np.abs(depth - surface) <= room
         close |= depth < near
-    return ((seen_through >= _MIN_PHOTOS) & (confirmed <= _MAX_CONFIRMED * seen_through)) | (
-        close & (confirmed < _MIN_PHOTOS)
-    ), shown == 0
+    in_free_space = (seen_through >= _MIN_PHOTOS) & (confirmed <= _MAX_CONFIRMED * seen_through)
+    unconfirmed = close & (confirmed < _MIN_PHOTOS)
+    return in_free_space | unconfirmed, shown == 0

@@ -327,11 +327,8 @@ def _hole_gaussians(splats: Splats, grid: Grid, hole: BoolArray, scale: float) -
 
     The splats are in the surface's frame.
     """
-    floor, height, cells = (
-        SUPPORT_TOLERANCE * scale,
-        splats.means[:, 2].astype(np.float64),
-        grid.cells(splats.means[:, :2].astype(np.float64)),
-    )
+    means = splats.means.astype(np.float64)
+    floor, height, cells = SUPPORT_TOLERANCE * scale, means[:, 2], grid.cells(means[:, :2])
     near = (cells >= 0).all(axis=1) & (height <= floor) & (height > -MAX_THING_HEIGHT * scale)
     rows = np.flatnonzero(near)
     rows = rows[hole[tuple(cells[rows].T)]]

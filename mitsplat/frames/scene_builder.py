@@ -76,9 +76,13 @@ class SceneBuilder:
         return {
             "type": "scene",
             **self._surroundings(layout.index, belt),
-            **self._reuse("objects", layout, lambda: _object_shapes(self._scene, layout)),
+            **self.objects(layout),
             **self.emitters(lights, movable=replaced_lights or self._has_moving_lights),
         }
+
+    def objects(self, layout: Layout) -> dict[str, mi.Shape]:
+        """Return the shapes of the objects of a layout by name."""
+        return self._reuse("objects", layout, lambda: _object_shapes(self._scene, layout))
 
     def emitters(self, lights: tuple[LightSpec, ...], *, movable: bool) -> MitsubaDict:
         """Return the emitters of lights by name; movable ones can move without recompilation of kernels."""

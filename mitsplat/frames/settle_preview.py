@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from PIL import Image, ImageDraw
 from rich.table import Table
@@ -70,9 +69,12 @@ def write_preview(scene: Scene, layout: Layout, path: Path) -> tuple[int, list[s
         pictures.append(_mark(picture, shown))
     step = round(_INTERVAL * 1000)
     durations = [step] * (len(pictures) - 1) + [_PAUSE]
-    film: dict[str, Any] = {"save_all": True, "append_images": pictures[1:], "duration": durations, "loop": 0}
+
+    def write(part: Path) -> None:
+        pictures[0].save(part, "GIF", save_all=True, append_images=pictures[1:], duration=durations, loop=0)
+
     with storage_errors(path):
-        write_file(path, lambda part: pictures[0].save(part, "GIF", **film))
+        write_file(path, write)
     return len(pictures), again
 
 

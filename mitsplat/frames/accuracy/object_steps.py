@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +13,6 @@ from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.renderer.materials.proxy_materials import MaterialColumns, part_materials
 from mitsplat.renderer.occluders.proxies import Occluder, world_corners
 from mitsplat.renderer.rays.device_arrays import wrapped
-from mitsplat.renderer.scene_emitters import MitsubaDict
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.scene import Scene
 
@@ -31,12 +29,10 @@ def without_materials(scene: Scene) -> Scene:
 class MeshSceneBuilder(SceneBuilder):
     """Builder of scenes whose objects are visible meshes: their proxies with the BSDF ``principled``."""
 
-    def describe(self, layout: Layout, *arguments: Any, **keywords: Any) -> MitsubaDict:
-        """Return Mitsuba's scene dictionary, see :meth:`SceneBuilder.describe`."""
-        shapes = super().describe(layout, *arguments, **keywords)
-        splats = {name: shape for name, shape in shapes.items() if getattr(shape, "instance", 0)}
-        meshes = self._reuse("meshes", layout, lambda: {name: path_traced_mesh(one) for name, one in splats.items()})
-        return shapes | meshes
+    def objects(self, layout: Layout) -> dict[str, mi.Shape]:
+        """Return the meshes of the objects of a layout by name."""
+        splats = super().objects(layout)
+        return self._reuse("meshes", layout, lambda: {name: path_traced_mesh(one) for name, one in splats.items()})
 
 
 def path_traced_mesh(shape: mi.Shape) -> mi.Mesh:

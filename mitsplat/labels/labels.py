@@ -408,5 +408,6 @@ def _project_keypoints(
 
 
 def _with_depth(amodal: Silhouette, truth: Truth) -> int:
+    """Return the number of pixels of a silhouette at which the image has a depth."""
     x0, y0, x1, y1 = amodal.box
     return int(np.count_nonzero(amodal.mask & (truth.depth[y0:y1, x0:x1] > 0)))

@@ -12,6 +12,8 @@ from mitsplat.arrays import ByteImage
 from mitsplat.labels.labels import InstanceLabel, Labels
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+OPACITY = 0.45
+"""Opacity of drawn masks."""
 
 
 def class_colour(class_index: int) -> tuple[int, int, int]:
@@ -21,21 +23,15 @@ def class_colour(class_index: int) -> tuple[int, int, int]:
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def draw_labels(image: ByteImage, labels: Labels, *, opacity: float = 0.45) -> ByteImage:
-    """Return an image with the masks, outlines, boxes and class names of its instances.
-
-    Args:
-        image: RGB image, (H, W, 3).
-        labels: Labels of the image.
-        opacity: Opacity of the masks.
-    """
+def draw_labels(image: ByteImage, labels: Labels) -> ByteImage:
+    """Return an RGB image (H, W, 3) with the masks, outlines, boxes and class names of its instances."""
     drawn = image.copy()
     unit = max(1.0, image.shape[1] / 640)
     for label in labels.instances:
         x0, y0, x1, y1 = label.box
         view = drawn[y0:y1, x0:x1]
         colour = np.array(class_colour(label.class_index))
-        view[label.mask] = np.rint((1 - opacity) * view[label.mask] + opacity * colour)
+        view[label.mask] = np.rint((1 - OPACITY) * view[label.mask] + OPACITY * colour)
     for label in labels.instances:
         _draw_edges(drawn, label, unit)
     for label in labels.instances:  # names last, so that nothing covers them
@@ -44,6 +40,7 @@ def draw_labels(image: ByteImage, labels: Labels, *, opacity: float = 0.45) -> B
 
 
 def _draw_edges(image: ByteImage, label: InstanceLabel, unit: float) -> None:
+    """Draw the outline and the box of a label into an image; ``unit`` is the width of a line [px]."""
     x0, y0, x1, y1 = label.box
     colour = class_colour(label.class_index)
     contours, _ = cv2.findContours(label.mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -52,6 +49,7 @@ def _draw_edges(image: ByteImage, label: InstanceLabel, unit: float) -> None:
 
 
 def _draw_name(image: ByteImage, label: InstanceLabel, unit: float) -> None:
+    """Draw the class name of a label above its box into an image; ``unit`` is the width of a line [px]."""
     x0, y0 = label.box[:2]
     scale, thickness = 0.42 * unit, max(1, round(unit))
     (width, height), baseline = cv2.getTextSize(label.class_name, _FONT, scale, thickness)

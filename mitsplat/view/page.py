@@ -102,7 +102,7 @@ class Page:
         self._groups = self.gui.add_folder("Show", order=1000, visible=False)
         with self._groups:
             self._thinned = self.gui.add_markdown("", visible=False)
-        self._boxes: dict[str, Any] = {}
+        self._group_names: set[str] = set()
 
     def close(self) -> None:
         """Stop the server."""
@@ -238,14 +238,13 @@ class Page:
         return distance * self._start.height / (self._start.fy * _PANE_HEIGHT)
 
     def _add_group(self, group: str) -> None:
-        if group in self._boxes:
+        if group in self._group_names:
             return
+        self._group_names.add(group)
         visible, self._groups.visible = group not in HIDDEN_AT_START, True
         root = self._server.scene.add_frame(f"/{group}", show_axes=False, visible=visible)
         with self._groups:
             box = self.gui.add_checkbox(group, visible)
-        self._boxes[group] = box
-
         box.on_update(lambda _: setattr(root, "visible", box.value))
 
     def _add(self, part: ShownPart) -> viser.SceneNodeHandle:

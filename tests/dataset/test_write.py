@@ -30,7 +30,7 @@ from mitsplat.formats.format import Catalogue
 from mitsplat.formats.yolo import data_yaml
 from mitsplat.frames.layer_sheet import layer_sheet
 from mitsplat.labels.labels import Labels
-from mitsplat.labels.overlay import class_colour, draw_labels
+from mitsplat.labels.overlay import OPACITY, class_colour, draw_labels
 from mitsplat.runtime import device as devices
 from mitsplat.runtime.device import Device, Gpu
 from mitsplat.scene.loading.scene_loading import load_scene
@@ -488,13 +488,12 @@ class Told:
 
 class TestPictures:
     def test_masks_are_tinted_with_the_class_colour(self, scene):
-        frame = render(scene, 0, layout=settle(scene, 0, progress=print))
-        frame.image[:] = 0
-        drawn = draw_labels(frame.image, frame.labels, opacity=1.0)
-        assert not frame.image.any()
-        entry = frame.labels.instances[0]
-        x0, y0, x1, y1 = entry.box
-        assert tuple(drawn[(y0 + y1) // 2, (x0 + x1) // 2]) == class_colour(entry.class_index)
+        labels = render(scene, 0, layout=settle(scene, 0, progress=print)).labels
+        entry = replace(labels.instances[0], box=(20, 20, 80, 80), mask=np.ones((60, 60), dtype=bool))
+        image = np.zeros((100, 100, 3), np.uint8)
+        drawn = draw_labels(image, replace(labels, width=100, height=100, instances=(entry,)))
+        assert not image.any()
+        np.testing.assert_array_equal(drawn[50, 50], np.rint(np.multiply(OPACITY, class_colour(entry.class_index))))
 
     def test_colours_of_many_classes_differ(self):
         assert len({class_colour(i) for i in range(64)}) == 64

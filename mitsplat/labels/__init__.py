@@ -2,6 +2,7 @@
 
 Input: ids, depth and silhouettes. Output: :class:`Labels` with an exclusive mask, polygons that rasterise back to the
 mask, boxes, visible fraction, truncation and keypoints for every instance, and counts of dropped instances per rule.
+:mod:`.labels` applies the rules, :mod:`.keypoint_visibility` finds keypoints that meshes hide.
 """
 
 from __future__ import annotations

@@ -103,14 +103,15 @@ class Mcmc:
         return min(self._most, int(max(planned, _GROWTH * count)))
 
 
-def seed_splats(points: Float64Array, colours: Float64Array, sh_degree: int, *, opacity: float = 0.5) -> Splats:
-    """Return isotropic Gaussians at points, half as large as the mean distance to the three nearest neighbours.
+def seed_splats(points: Float64Array, colours: Float64Array, sh_degree: int) -> Splats:
+    """Return isotropic, half opaque Gaussians at points.
+
+    Their standard deviation is half the mean distance to the three nearest neighbours.
 
     Args:
         points: Centres, shape (N, 3), N > 1.
         colours: Display-encoded colours in [0, 1], shape (N, 3).
         sh_degree: Degree of the spherical harmonics; all but the constant ones are zero.
-        opacity: Opacity of every Gaussian.
     """
     distance, _ = KDTree(points).query(points, k=min(4, len(points)))
     near = distance[:, 1:].mean(axis=1)
@@ -121,7 +122,7 @@ def seed_splats(points: Float64Array, colours: Float64Array, sh_degree: int, *, 
         means=points.astype(np.float32),
         quats=np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (len(points), 1)),
         scales=np.repeat(0.5 * near[:, None], 3, axis=1).astype(np.float32),
-        opacities=np.full(len(points), opacity, dtype=np.float32),
+        opacities=np.full(len(points), 0.5, dtype=np.float32),
         sh=sh.astype(np.float32),
     )
 

@@ -78,7 +78,7 @@ def test_what_the_photo_does_not_show_is_not_counted() -> None:
 def model() -> GaussianModel:
     """Build six Gaussians in a row, in the model's unit: two small, two large, one faint, one very large."""
     ensure_variant()
-    splats = seed_splats(np.arange(18.0).reshape(6, 3), np.full((6, 3), 0.5), 0, opacity=0.8)
+    splats = seed_splats(np.arange(18.0).reshape(6, 3), np.full((6, 3), 0.5), 0)
     size = np.array([0.002, 0.002, 0.05, 0.05, 0.002, 0.5])
     opacities = np.where(np.arange(6) == 4, 0.004, 0.8)
     own = GaussianModel(replace(splats, scales=UNIT * np.repeat(size[:, None], 3, axis=1), opacities=opacities), UNIT)

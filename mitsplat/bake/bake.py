@@ -173,11 +173,11 @@ def bake_asset(
     settings = BakeSettings() if settings is None else settings
     check_type(settings, BakeSettings, "settings", "for example mitsplat.BakeSettings(gaussians=10000)")
     check_text(name, "name")
-    for values, member, place in (
-        *((cameras, Camera, "cameras"), (fit_cameras, Camera, "fit_cameras")),
-        *((pieces, trimesh.Trimesh, "pieces"), (() if lights is None else lights, DrawnLight, "lights")),
-    ):
-        check_list(values, member, place)
+    check_list(cameras, Camera, "cameras")
+    check_list(fit_cameras, Camera, "fit_cameras")
+    check_list(pieces, trimesh.Trimesh, "pieces")
+    if lights is not None:
+        check_list(lights, DrawnLight, "lights")
     _check_values(kind, metres_per_unit, up, density, friction)
     stages = _Stages(progress)
     emitters = None if lights is None else bake_lights(lights)

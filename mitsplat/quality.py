@@ -62,8 +62,8 @@ class Quality:
             depths and instances stay those of the tile's order.
         sh_degree: Highest spherical-harmonic degree that is evaluated.
         samples: Rays per pixel along each axis (n x n on a regular grid, box-filtered), which share the light of the
-            pixel's centre. ``edges`` takes one ray. Every value except 1 takes rays with their own light at borders
-            between instances, see :mod:`mitsplat.renderer.instances.antialiasing`.
+            pixel's centre. ``edges`` takes one ray. At borders between instances or meshes, all values but 1 take
+            several rays, each with the light of its own side, see :mod:`mitsplat.renderer.instances.antialiasing`.
         lens_rings: Rings of sample points around the centre of a thin lens: 1, 2, 3 take 7, 19, 37 images. Wide blur
             shows single points, and more rings make it smooth.
     """

@@ -28,7 +28,7 @@ class OpenCVCamera(mi.Sensor):
 
      * - distortion
        - |string|
-       - Coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``, or ``k1 k2 k3 k4`` of a fisheye lens. (Default: none)
+       - Coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]``, or ``k1 k2 k3 k4`` of a fisheye. (Default: none)
 
      * - lens
        - |string|

@@ -1,7 +1,7 @@
 """Conversion of photographs to camera poses, metric scale and object masks.
 
 Input: a folder of photographs, optionally with a printed board in them or with poses of another tool. Output: a
-:class:`Capture` with undistorted photos, their cameras in a metric frame (z up), the points of structure from motion,
+:class:`Capture` with photos, their cameras with lenses in a metric frame (z up), the points of structure from motion,
 and masks of the object.
 """
 

@@ -1,4 +1,4 @@
-"""Rays between the camera and keypoints. A keypoint is hidden only if a surface blocks them.
+"""Rays between the camera and keypoints. A keypoint is hidden if a surface blocks all of its rays.
 
 The rays end at the proxy surface of the keypoint's own object, so that this object hides its own far side, but not the
 point itself. Rays are straight under every lens distortion.

@@ -1,4 +1,6 @@
-"""Rigid-body simulation: a Newton model, stepped by MuJoCo's solver on Warp or in C.
+"""Rigid-body simulation with the solver of MuJoCo: in C, or its port to Warp.
+
+Both worlds are built from one model of the library Newton.
 
 Import and use this module within :func:`mitsplat.physics.settle.warp_settings`, which shortens compilation.
 """

@@ -1,4 +1,4 @@
-"""Antialiasing of silhouettes: at borders between instances, a pixel is the mean of several rays with their own light.
+"""Antialiasing of silhouettes: at borders between instances, a pixel is the mean of rays with the light of their side.
 
 One ray through a pixel's centre sees only one side of a silhouette, so that its outline shows steps. The mean of
 several rays times the light of the pixel's centre shows specks where both sides differ in light. Pixels with a

@@ -1,4 +1,6 @@
-"""Specular lobe of Mitsuba's BSDF ``principled``: GGX microfacets with the Fresnel terms of metals and dielectrics.
+"""Specular lobe and diffuse albedo of Mitsuba's BSDF ``principled``.
+
+The lobe is that of GGX microfacets with the Fresnel terms of metals and dielectrics.
 
 Reflected light is linear in the base colour c. With the density D of microfacets, masking G, the half vector h and the
 camera's direction v,

@@ -1,9 +1,10 @@
 """Instance votes: the instance with the largest share of a ray, for any number of instances.
 
-The first walk of a ray sums the weights of the environment and of the first instances that it meets. These sums are
-complete, because no instance leaves its slot. All other instances share one sum. The largest complete sum wins, unless
-the shared sum is larger. In that case the ray is walked again: each walk sums the weights of the next instances in the
-order of ids, until the remaining instances together weigh less than the best one.
+The state of a ray has a fixed size, but a ray may meet any number of instances. The first walk of a ray sums the
+weights of the environment and of the first instances that it meets. These sums are complete, because a slot is never
+given to another instance. All other instances share one sum. The largest complete sum wins, unless the shared sum is
+larger. In that case the ray is walked again: each walk sums the weights of the next instances in the order of ids,
+until the remaining instances together weigh less than the best one.
 """
 
 from __future__ import annotations

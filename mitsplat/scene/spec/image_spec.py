@@ -207,7 +207,8 @@ class Composite(StrictModel):
         "auto",
         description="``auto`` meters the picture: its mean encoded luminance is middle grey, 118 of 255. "
         "``fixed`` shows a white surface of radiance 1 W/(m^2 sr) as white, or that of the stated "
-        "``white`` of a captured environment. A mapping is the exposure of a camera. ``randomise.exposure`` is added in all cases.",
+        "``white`` of a captured environment. A mapping is the exposure of a camera. ``randomise.exposure`` is "
+        "added in all cases.",
     )
     white_balance: Annotated[
         Kelvin | Literal["auto"],

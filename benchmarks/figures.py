@@ -12,7 +12,7 @@ Pages are made from templates in ``benchmarks/templates``, where ``{{ ... }}`` s
 * ``revision RESULT``: the revision and its date;
 * ``runs RESULT ...``: the same as a table; ``runs`` alone, of all results;
 * ``detectors PLAN ARM ...``: a table of results of arms of ``benchmarks.detector``; ``detectors PLAN``, of all;
-* ``detector PLAN ARM``: the mean precision of an arm;
+* ``detector PLAN ARM``: the mean precision of an arm; ``detector_interval PLAN ARM``: its 95 % interval;
 * ``gain PLAN ARM BASELINE``: table cells of its gain over another arm, and the 95 % interval.
 
 Missing figures are errors. ``sentences.md`` lists sentences of hand-written pages; each must occur in its page.
@@ -29,7 +29,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.detector.table import experiment_table, gain_cells, mean_precision
+from benchmarks.detector.table import experiment_table, gain_cells, mean_precision, precision_interval
 from benchmarks.record import MEASURED, RESULTS, ROOT, read_recorded
 from benchmarks.scale.projection import project
 
@@ -179,6 +179,8 @@ def filled(text: str, results: Results) -> str:
                     return experiment_table(results, *plan_and_arms)
                 case ["detector", plan, arm]:
                     return f"{mean_precision(results, plan, arm):.3f}"
+                case ["detector_interval", plan, arm]:
+                    return precision_interval(results, plan, arm)
                 case ["gain", plan, arm, baseline]:
                     return gain_cells(results, plan, arm, baseline)
                 case ["caption" | "runs" as what, *names] if names:

@@ -64,6 +64,15 @@ def mean_precision(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str
     return _mean(_by_arm(results, plan, arm)[arm], "map50_95")
 
 
+def precision_interval(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str) -> str:
+    """Return the 95 % interval of the mean precision of an arm.
+
+    Raises:
+        KeyError: If it has no result.
+    """
+    return _interval(precision_draws(results, plan, arm)[arm])
+
+
 def gain_cells(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str, baseline: str) -> str:
     """Return the gain of an arm over a baseline and its 95 % interval, as two cells of a table.
 

@@ -94,6 +94,19 @@ def check_list(value: object, kind: type, place: str) -> None:
             raise InputError(f"{place}[{number}] must be a {kind.__name__} (got {describe(one)})")
 
 
+def real_array(value: npt.ArrayLike, kind: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+    """Return an argument of the Python API as a new array of real numbers.
+
+    Raises:
+        TypeError, ValueError: If it has other values, such as text or complex numbers, or masked ones, which NumPy
+            replaces by those below the mask.
+    """
+    given = np.asarray(value)
+    if np.ma.is_masked(value) or given.dtype.kind in "cmM":
+        raise TypeError("not real numbers, or masked ones")
+    return np.array(given, dtype=kind, order="C")
+
+
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
 
 
@@ -201,7 +214,7 @@ def _check_argument(value: Any, hint: Any, place: str) -> None:
     """
     if hint == npt.ArrayLike:
         try:
-            is_numeric = np.asarray(value).dtype.kind in "biuf"
+            is_numeric = np.asarray(value).dtype.kind in "biuf" and not np.ma.is_masked(value)
         except ValueError:
             is_numeric = False
         if not is_numeric:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Literal, get_type_hints
 
 import numpy as np
@@ -137,3 +138,39 @@ def test_annotations_of_all_forms_are_checked_by_their_meaning() -> None:
         part.moved([], 1.5)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="side must be left or right"):
         part.named(5, np.zeros(2))  # type: ignore[arg-type]
+
+
+MASKED = np.ma.masked_array(np.eye(4), mask=np.eye(4) > 0)
+"""Matrix with masked values, which NumPy replaces by those below the mask."""
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: replace(CAMERA, world_from_camera=MASKED), r"must be a finite 4x4 matrix .*\(got masked_array"),
+        (lambda: replace(CAMERA, world_from_camera=np.eye(4) + 0j), r"must be a finite 4x4 matrix"),
+        (lambda: replace(CAMERA, distortion=np.ma.masked_array([0.1, 0, 0, 0], mask=[1, 0, 0, 0])), "no masked coeff"),
+        (lambda: replace(CAMERA, fx=True), r"fx must be a number \(got bool True\)"),
+        (lambda: CAMERA.project(MASKED[:, :3]), "points must be an array of numbers"),
+        (lambda: SPLATS.transformed(MASKED), "must be an array of numbers"),
+        (lambda: SPLATS.select(np.ma.masked_array(np.ones(5, bool), mask=np.arange(5) > 2)), "no masked values"),
+        (
+            lambda: replace(SPLATS, means=np.ma.masked_array(np.zeros((5, 3)), mask=True)),
+            "means must be an array of num",
+        ),
+        (lambda: replace(SPLATS, means=np.zeros((5, 3), complex)), "means must be an array of numbers"),
+        (lambda: replace(SPLATS, means=np.zeros((5, 3), "datetime64[s]")), "means must be an array of numbers"),
+    ],
+)
+def test_masked_and_complex_arrays_are_refused(call: Callable[[], Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        call()
+
+
+def test_numbers_of_few_bits_do_not_overflow_in_a_camera() -> None:
+    """Twice the width of 200 px was 144 px, and products of both sides were wrong."""
+    small = Camera(np.uint8(200), np.uint8(150), np.float16(90), np.float32(90), np.int8(100), 75, np.eye(4))
+    assert (small.width * small.height, type(small.width), type(small.fx)) == (30000, int, float)
+    assert Camera.from_json(small.to_json()).to_json() == small.to_json()
+    masked = np.ma.masked_array(np.eye(4))  # without masked values
+    assert replace(small, world_from_camera=masked).to_json() == small.to_json()

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from mitsplat.arguments import checks_arguments, describe, path_of
+from mitsplat.arguments import checks_arguments, describe, path_of, real_array
 from mitsplat.arrays import AnyArray, BoolArray, Float32Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import read_materials
@@ -70,7 +70,7 @@ class Splats:
         for name in SplatArrays._fields:
             try:
                 with np.errstate(over="ignore"):  # values beyond float32 become inf, which is refused below
-                    arrays[name] = np.array(getattr(self, name), dtype=np.float32, order="C")
+                    arrays[name] = real_array(getattr(self, name), np.float32)
             except (TypeError, ValueError):
                 raise InputError(f"{name} must be an array of numbers (got {describe(getattr(self, name))})") from None
         count = len(arrays["means"]) if arrays["means"].ndim else 0
@@ -224,6 +224,8 @@ def _rows_of(index: npt.ArrayLike, count: int) -> AnyArray:
         InputError: If it is another array, or has another length, or selects a missing row.
     """
     rows = np.atleast_1d(np.asarray(index))
+    if np.ma.is_masked(index):
+        raise InputError(f"index must have no masked values (got {describe(index)})")
     if not rows.size:
         return np.zeros(0, dtype=np.int64)
     if rows.dtype.kind not in "biu":

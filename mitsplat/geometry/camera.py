@@ -84,8 +84,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy", "near", "aperture_radius", "focus_distance"):
-            if not isinstance(getattr(self, name), int | float | np.integer | np.floating):
-                raise ValueError(f"{name} must be a number (got {describe(getattr(self, name))})")
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+                raise ValueError(f"{name} must be a number (got {describe(value)})")
+            object.__setattr__(self, name, float(value))  # numbers of few bits would overflow later
         sides = self.width, self.height
         if not all(
             isinstance(side, int | np.integer) and side is not True and 1 <= side <= MAX_IMAGE_SIDE for side in sides
@@ -93,6 +95,8 @@ class Camera:
             raise ValueError(
                 f"camera size must be whole numbers of 1 to {MAX_IMAGE_SIDE} px (got {sides[0]}x{sides[1]})"
             )
+        for name in ("width", "height"):
+            object.__setattr__(self, name, int(getattr(self, name)))
         if not np.isfinite([self.cx, self.cy]).all():
             raise ValueError(f"the principal point must be finite (got cx={self.cx}, cy={self.cy})")
         if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy]).all()):

@@ -71,8 +71,10 @@ def flat_coefficients(values: Any) -> tuple[Any, ...]:
     of the values are not checked.
 
     Raises:
-        ValueError: If they are not in one row or column. The message is a rule that begins with "must".
+        ValueError: If they are masked or not in one row or column. The message is a rule that begins with "must".
     """
+    if np.ma.is_masked(values):
+        raise ValueError("must have no masked coefficients")
     array = np.array(values, dtype=object)
     if max(array.shape, default=1) != array.size:
         raise ValueError(f"must be a list of coefficients (got an array of shape {array.shape})")

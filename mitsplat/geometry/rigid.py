@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arguments import describe
+from mitsplat.arguments import describe, real_array
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 
@@ -33,7 +33,7 @@ def rigid_matrix(pose: npt.ArrayLike, frames: str, *, tolerance: float = RIGID) 
         ValueError: If the pose is not a rotation and a translation. The message is a rule that begins with "must".
     """
     try:
-        matrix = np.array(pose, dtype=np.float64)
+        matrix = real_array(pose)
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
@@ -66,7 +66,7 @@ def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float6
         InputError: If the matrix is not finite, or not a rotation with a uniform scale and a translation.
     """
     try:
-        values = np.array(matrix, dtype=np.float64)
+        values = real_array(matrix)
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.shape != (4, 4) or not np.isfinite(values).all():
@@ -117,7 +117,7 @@ def points_of(value: npt.ArrayLike, place: str) -> Float64Array:
         InputError: If it is no array of points.
     """
     try:
-        points = np.atleast_2d(np.asarray(value, dtype=np.float64))
+        points = np.atleast_2d(real_array(value))
     except (TypeError, ValueError):
         raise InputError(f"{place} must be numbers of shape (N, 3) (got {describe(value)})") from None
     if points.ndim != 2 or points.shape[1] != 3:

@@ -126,6 +126,18 @@ def check_fields(settings: object) -> None:
             raise InputError(f"{name} must be {list_in_words(words, 'or')} (got {describe(value)})")
 
 
+def check_least(settings: object, **least: float) -> None:
+    """Check that fields of a dataclass of settings, if they are not None, have at least the given values.
+
+    Raises:
+        InputError: If a field has a smaller value.
+    """
+    for name, minimum in least.items():
+        value = getattr(settings, name)
+        if value is not None and value < minimum:
+            raise InputError(f"{name} must be at least {minimum} (got {value})")
+
+
 def _has_kind(value: object, kind: Any) -> bool:
     """Return True if a value has the type of an annotation; the items of lists and mappings are not checked."""
     if get_origin(kind) is Literal:

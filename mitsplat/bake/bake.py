@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mitsplat.arguments import check_fields, check_list, check_number, check_text, check_type
+from mitsplat.arguments import check_fields, check_least, check_list, check_number, check_text, check_type
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshModel, MeshPart, bake_lights, mitsuba_scene, read_model
@@ -116,9 +116,7 @@ class BakeSettings:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in ("gaussians", "proxy_faces"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1 (got {getattr(self, name)})")
+        check_least(self, gaussians=1, proxy_faces=1)
         if self.gaussians > _MAX_GAUSSIANS:
             raise InputError(f"gaussians must be at most {_MAX_GAUSSIANS} (got {self.gaussians})")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from mitsplat.arguments import check_fields, check_least
 from mitsplat.detector.libraries import STRIDE, check_device
 from mitsplat.errors import InputError
 from mitsplat.storage.content_hash import file_hash
@@ -44,10 +45,8 @@ class TrainSettings:
     workers: int | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("batch", 1), ("size", 2 * STRIDE), ("seed", 0), ("workers", 0)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise InputError(f"{name} must be {least} or more (got {value})")
+        check_fields(self)
+        check_least(self, steps=1, batch=1, size=2 * STRIDE, seed=0, workers=0)
         if self.seed >= 2**32:
             raise InputError(f"seed must be less than 2^32 (got {self.seed})")
         if self.size % STRIDE:
@@ -57,8 +56,6 @@ class TrainSettings:
         if self.real_size is not None and self.real_size < self.size:
             raise InputError(f"real_size must be at least size, {self.size} px (got {self.real_size})")
         check_device(self.device)
-        if self.weights is not None:
-            object.__setattr__(self, "weights", Path(self.weights))
 
     def weight_settings(self) -> JsonObject:
         """Return the settings that affect the weights, without ``device`` and ``workers``."""

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.arguments import check_fields, check_type, path_of
+from mitsplat.arguments import check_fields, check_least, check_type, path_of
 from mitsplat.arrays import AnyArray
 from mitsplat.capture.capture import HELD_OUT_EVERY, Capture, Photo, Window
 from mitsplat.errors import InputError
@@ -101,9 +101,7 @@ class FitSettings:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name, least in (("gaussians", 2), ("iterations", 1), ("max_size", 64), ("refine_every", 1), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} must be at least {least} (got {getattr(self, name)})")
+        check_least(self, gaussians=2, iterations=1, max_size=64, refine_every=1, seed=0)
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree must be 0, 1, 2 or 3 (got {self.sh_degree})")
         if self.target_psnr is not None and not np.isfinite(self.target_psnr):

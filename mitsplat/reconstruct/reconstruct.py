@@ -49,6 +49,7 @@ class ReconstructSettings:
     refine: MeshRefineSettings | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.size is not None and not 1e-4 <= self.size <= 1e4:
             raise InputError(f"size must be 0.0001 to 10000 m (got {self.size:g})")
 

@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.arguments import check_fields, check_least
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
@@ -73,9 +74,8 @@ class MeshRefineSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("size", 16)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} must be at least {least} (got {getattr(self, name)})")
+        check_fields(self)
+        check_least(self, steps=1, size=16)
         for name in ("rate", "smoothness"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InputError(f"{name} must be finite and > 0 (got {getattr(self, name)})")

@@ -22,6 +22,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_ed
 from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
+from mitsplat.arguments import check_fields, check_least
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
@@ -88,10 +89,10 @@ class SurfaceSettings:
     faces: int = 10_000
 
     def __post_init__(self) -> None:
+        check_fields(self)
+        check_least(self, faces=100)
         if not 16 <= self.voxels <= 512:
             raise InputError(f"voxels must be from 16 to 512 (got {self.voxels})")
-        if self.faces < 100:
-            raise InputError(f"faces must be at least 100 (got {self.faces})")
         if not 0 <= self.dissent <= 3:
             raise InputError(f"dissent must be from 0 to 3 (got {self.dissent})")
 

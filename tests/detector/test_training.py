@@ -49,14 +49,15 @@ def test_importing_detector_and_cli_loads_no_heavy_library(module: str) -> None:
 
 
 SETTINGS: dict[str, tuple[dict[str, Any], str]] = {
-    "steps": ({"steps": 0}, r"steps must be 1 or more \(got 0\)"),
-    "batch": ({"batch": 0}, r"batch must be 1 or more \(got 0\)"),
-    "small": ({"size": 32}, r"size must be 64 or more \(got 32\)"),
+    "steps": ({"steps": 0}, r"steps must be at least 1 \(got 0\)"),
+    "batch": ({"batch": 0}, r"batch must be at least 1 \(got 0\)"),
+    "small": ({"size": 32}, r"size must be at least 64 \(got 32\)"),
     "odd": ({"size": 100}, r"size must be a multiple of 32 px \(got 100\)"),
     "share": ({"share": 1.0}, r"share of real images must lie between 0 and 1 \(got 1\)"),
     "real_size": ({"real_size": 320}, r"real_size must be at least size, 640 px \(got 320\)"),
     "large seed": ({"seed": 2**32}, r"seed must be less than 2\^32 \(got 4294967296\)"),
-    "seed": ({"seed": -1}, r"seed must be 0 or more"),
+    "seed": ({"seed": -1}, r"seed must be at least 0"),
+    "text": ({"steps": "10"}, r"steps must be a whole number \(got str '10'\)"),
     "device": ({"device": "gpu"}, r"device must be auto, cpu, cuda or cuda:N \(got gpu\)"),
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -103,8 +104,8 @@ def test_masks_without_a_common_solid_are_refused(known_object: KnownObject) -> 
         reconstruct_surface(known_object.splats, cameras, [0 * mask for mask in masks], SurfaceSettings(voxels=32))
 
 
-@pytest.mark.parametrize(("field", "value"), [("voxels", 5), ("faces", 3), ("dissent", 9)])
-def test_settings_out_of_range_are_refused(field: str, value: int) -> None:
+@pytest.mark.parametrize(("field", "value"), [("voxels", 5), ("faces", 3), ("dissent", 9), ("voxels", "96")])
+def test_settings_out_of_range_are_refused(field: str, value: Any) -> None:
     with pytest.raises(InputError, match=field):
         SurfaceSettings(**{field: value})
 

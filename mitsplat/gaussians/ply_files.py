@@ -56,7 +56,7 @@ def decode_ply(data: bytes) -> SplatArrays:
     if "packed_position" in names:
         return decode_ply(convert_apart(_with_colour_ranges(data, form, elements, start), "compressed.ply", "ply"))
     scale_names = _SCALES if _SCALES[2] in names else _SCALES[:2]  # 2DGS has two
-    _check_names(names, scale_names)
+    _check_names(names, scale_names, has_faces="face" in elements)
     rows = vertex_rows(data, form, elements, start)
     check_encoding(*(columns_of(rows, names) for names in (_MEANS, scale_names, ("opacity",), _COLOUR)))
     if len(scale_names) == 3 and len(rows) and rows[_SCALES[2]].max() < _LEAST_LOGARITHM:
@@ -83,11 +83,13 @@ def decode_ply(data: bytes) -> SplatArrays:
     )
 
 
-def _check_names(names: tuple[str, ...], scale_names: tuple[str, ...]) -> None:
+def _check_names(names: tuple[str, ...], scale_names: tuple[str, ...], *, has_faces: bool) -> None:
     """Raise InputError if properties of the vertices are missing or of another number than SH coefficients."""
     missing = [n for n in (*_MEANS, *_COLOUR, "opacity", *scale_names, *_QUATS) if n not in names]
     if missing:
         cause = ": export coefficients in place of red, green, blue" if {"red", "f_dc_0"} <= {*names, *missing} else ""
+        if has_faces and "opacity" in missing:
+            cause = ": it is a mesh, which `mitsplat bake` reads"
         raise InputError(f"a PLY file of splats must have the vertex properties {', '.join(missing)} (missing){cause}")
     rest = sum(name.startswith("f_rest_") for name in names)
     rest_names = [f"f_rest_{i}" for i in range(rest)]

@@ -88,8 +88,6 @@ def read_splats(path: Path) -> tuple[SplatArrays, KernelName | None]:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     refuse_placeholder(path, data[:MAX_PLY_HEADER])
     try:
-        if not data:
-            raise InputError("the file is empty")
         if (kind := _STARTS.get(data[:4], suffix)) != suffix:
             raise InputError(f"a {suffix} file must not begin as a {kind} file: rename it if it is one")
         arrays, kernel, warnings = _decode(data, suffix)

@@ -102,6 +102,8 @@ def _read(path: Path, *, warn: bool) -> Splats:
         raise InputError(f"it has no Gaussian splats ({EXTENSION}); `mitsplat bake` reads meshes")
     if warn and left_out:
         _logger.warning("%s: not read: %s", path, "; ".join(sorted(left_out)))
+    for warning in data.warnings if warn else ():
+        _logger.warning("%s: %s", path, warning)
     return Splats.concatenate(parts)
 
 

@@ -18,6 +18,7 @@ from mitsplat.arrays import AnyArray
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import item
+from mitsplat.storage.file_kinds import refuse_placeholder
 from mitsplat.storage.files import IMAGE_ERRORS, JsonObject
 
 _MAGIC, _JSON, _BINARY = b"glTF", 0x4E4F534A, 0x004E4942
@@ -48,6 +49,7 @@ class GltfData:
         self._binary = b""
         self.warnings: list[str] = []
         content = path.read_bytes() if content is None else content
+        refuse_placeholder(path, content[:1024])
         if content[:4] == _MAGIC:
             content = self._read_chunks(content)
         self.document: JsonObject = json.loads(content.rstrip(b"\0").decode("utf-8-sig"))

@@ -14,7 +14,17 @@ _MESH = "a mesh; bake it first: `mitsplat bake FILE -o FOLDER`"
 _STEP = "a STEP file; bake it first: `mitsplat bake FILE -o FOLDER`"
 _PICTURE = "an image"
 _DRAWING = "a CAD file; export it as .step, or as a mesh: .glb with colours or .stl"
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+_PROGRAM = "a file of a 3D program; export it as .glb"
+_ARCHIVE = "an archive; unpack it"
 _BY_SUFFIX = {
+    **dict.fromkeys((".fbx", ".blend", ".max", ".c4d", ".ma", ".mb", ".3ds", ".x3d", ".wrl", ".lwo", ".abc"), _PROGRAM),
+    **dict.fromkeys((".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz"), _ARCHIVE),
+    **dict.fromkeys(
+        (".usd", ".usda", ".usdc", ".usdz"), "a USD stage; `mitsplat import` reads its splats, export meshes as .glb"
+    ),
+    **dict.fromkeys((".pt", ".pth", ".ckpt"), "a checkpoint of a training; export its splats as .ply"),
+    **dict.fromkeys(VIDEO_SUFFIXES, "a video; `mitsplat capture` reads it"),
     **dict.fromkeys((".splat", ".ksplat", ".spz", ".sog"), _SPLATS),
     **dict.fromkeys((".stl", ".obj", ".glb", ".gltf", ".off", ".3mf", ".dae"), _MESH),
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff"), _PICTURE),
@@ -56,7 +66,7 @@ def refuse_other_kinds(path: Path, wanted: str, *suffixes: str) -> None:
 
 
 def refuse_placeholder(path: Path, start: bytes) -> None:
-    """Refuse a file with the content of another one: a Git LFS pointer, or a web page of a failed download.
+    """Refuse an empty file, and one with the content of another: a Git LFS pointer, or a web page of a failed download.
 
     Args:
         path: The file.
@@ -65,6 +75,8 @@ def refuse_placeholder(path: Path, start: bytes) -> None:
     Raises:
         InputError: If it is one.
     """
+    if not start:
+        raise InputError(f"{path}: the file is empty")
     text = start.lstrip()[:40].lower()
     if text.startswith(b"version https://git-lfs"):
         raise InputError(f"{path}: is a Git LFS pointer in place of the file: get the file by `git lfs pull`")

@@ -21,6 +21,7 @@ from ruamel.yaml.scanner import RoundTripScanner
 
 from mitsplat.arguments import describe
 from mitsplat.errors import InputError
+from mitsplat.storage.file_kinds import refuse_placeholder
 from mitsplat.storage.format_version import FORMAT_VERSION, check_format_version
 
 Validated = TypeVar("Validated", bound=BaseModel)
@@ -181,6 +182,8 @@ def _parse(path: Path) -> CommentedMap:
         if (size := path.stat().st_size) > MAX_BYTES:
             raise InputError(f"{path}: must have at most {MAX_BYTES >> 20} MiB (got {size} bytes)")
         text = path.read_text(encoding="utf-8")
+        if text:
+            refuse_placeholder(path, text[:80].encode())
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:

@@ -88,7 +88,7 @@ def test_texture_coordinates_of_obj_with_one_number_are_read(tmp_path: Path) -> 
 @pytest.mark.parametrize("suffix", [".fbx", ".usdz", ".blend", ".dxf", ""])
 def test_other_kinds_of_mesh_files_are_refused_with_a_remedy(tmp_path: Path, suffix: str) -> None:
     (tmp_path / f"a{suffix}").write_bytes(b"x" * 100)
-    with pytest.raises(InputError, match=r"must be a mesh \(.*\): export it as \.glb"):
+    with pytest.raises(InputError, match=r"must be a mesh \(.* export (it|meshes) as \.glb"):
         read_model(tmp_path / f"a{suffix}")
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from mitsplat.arrays import ByteImage
 from mitsplat.errors import InputError
+from mitsplat.storage.file_kinds import VIDEO_SUFFIXES, refuse_other_kinds
 
 _RATE = 30.0
 """Target frame rate [1/s]; of faster videos, every second, third ... frame is read."""
@@ -85,6 +86,7 @@ def open_video(file: Path) -> Iterator[VideoReader]:
     Raises:
         InputError: If it is not a readable video, or OpenCV fails while it is read.
     """
+    refuse_other_kinds(file, "a folder of photographs or a video", *VIDEO_SUFFIXES)
     opened = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
     try:
         if not opened.isOpened():

@@ -59,6 +59,8 @@ _MODELS: Mapping[str, tuple[int, ...]] = {
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
     "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 6, 7),  # k1, k2, k3, k4
+    "RADIAL_FISHEYE": (0, 0, 1, 2, 3, 4, -1, -1),
+    "SIMPLE_RADIAL_FISHEYE": (0, 0, 1, 2, 3, -1, -1, -1),
 }
 
 
@@ -198,7 +200,7 @@ def opencv_camera(
     pose = np.eye(4)
     pose[:3, :3] = (u @ vt).T
     pose[:3, 3] = -pose[:3, :3] @ camera_from_world[:3, 3]
-    fisheye = model == "OPENCV_FISHEYE"
+    fisheye = model.endswith("_FISHEYE")
     try:
         return Camera(
             *(int(width), int(height), fx, fy, cx, cy, pose),

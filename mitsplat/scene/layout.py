@@ -14,6 +14,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.scene.given_poses import asset_index, rigid_pose
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.scene_spec import MAX_INSTANCES
 from mitsplat.storage.files import JsonObject
 
 
@@ -179,6 +180,10 @@ class Layout:
                     "stands for an absent object"
                 )
         listed = [(asset, pose) for asset in sorted(lists) for pose in lists[asset]]
+        if len(listed) > MAX_INSTANCES:
+            raise InputError(
+                f"poses must be of at most {MAX_INSTANCES} objects, as ids have 16 bits (got {len(listed)})"
+            )
         instances = tuple(
             Instance(number, asset, scene.class_index(asset), np.asarray(pose))
             for number, (asset, pose) in enumerate(listed, start=1)

@@ -206,6 +206,29 @@ def test_fisheye_cameras_are_read_from_colmap_and_transforms_json(tmp_path: Path
         np.testing.assert_allclose(camera.project([[np.tan(angle), 0, 1]])[0], pixel, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("camera", "distortion"),
+    [
+        ("SIMPLE_RADIAL_FISHEYE 320 240 300 160 120 0.02", (0.02, 0.0, 0.0, 0.0)),
+        ("RADIAL_FISHEYE 320 240 300 160 120 0.02 -0.01", (0.02, -0.01, 0.0, 0.0)),
+    ],
+)
+def test_fisheye_lenses_of_fewer_parameters_are_read(
+    tmp_path: Path, camera: str, distortion: tuple[float, ...]
+) -> None:
+    """They are OPENCV_FISHEYE with one focal length and k3 = k4 = 0."""
+    given = tmp_path / "model"
+    given.mkdir()
+    (given / "cameras.txt").write_text(f"1 {camera}\n")
+    (given / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n")
+    (given / "points3D.txt").write_text("")
+    lens = sfm.read_colmap_model(given, tmp_path / "work").cameras["a.png"]
+    angle = 0.4
+    shown = angle * (1 + distortion[0] * angle**2 + distortion[1] * angle**4)
+    assert (lens.lens, lens.fx, lens.fy, lens.distortion) == ("fisheye", 300, 300, distortion)
+    np.testing.assert_allclose(lens.project([[0, np.tan(angle), 1]])[0], [[160, 120 + 300 * shown]], atol=1e-9)
+
+
 def test_cameras_that_no_point_confirms_are_reported(tmp_path: Path) -> None:
     """Three photos of unrelated noise have no common points."""
     (tmp_path / "photos").mkdir()

@@ -217,3 +217,13 @@ def test_shipped_scenes_have_no_value_in_another_unit(name: str) -> None:
 def test_a_pattern_of_assets_names_the_key_for_it(scene_data, write_scene) -> None:
     scene_data["objects"][0]["asset"] = "assets/*"
     assert "assets/*: no such folder; is it a pattern, for the key pool?" in error_of(write_scene(scene_data))
+
+
+def test_more_objects_than_ids_are_refused(scene_data, write_scene) -> None:
+    """The id maps of a layout with 70,000 objects would have repeated ids."""
+    scene_data["objects"] = [{"asset": "assets/nut", "count": [1, 40_000]}, {"asset": "assets/nut", "count": 25_535}]
+    load_yaml(write_scene(scene_data), SceneSpec)
+    scene_data["objects"][1]["count"] = 25_536
+    assert "objects: must be at most 65535 in a layout, as ids have 16 bits (got 65536)" in error_of(
+        write_scene(scene_data)
+    )

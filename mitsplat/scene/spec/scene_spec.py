@@ -131,6 +131,10 @@ class LabelRules(StrictModel):
     )
 
 
+MAX_INSTANCES = 65535
+"""Maximum number of objects of a layout; their ids in id maps have 16 bits."""
+
+
 class SceneSpec(StrictModel):
     """Scene file. Lengths are in metres, angles in degrees, z is up. Paths are relative to the file."""
 
@@ -227,6 +231,10 @@ class SceneSpec(StrictModel):
         distorted = not (self.output.rectify or self.camera.intrinsics.is_pinhole)
         if isinstance(self.depth_sensor, StereoSensor) and distorted:
             raise FieldError("depth_sensor", "stereo needs a camera without lens distortion, or output.rectify: true")
+        if (total := sum(entry.max_count for entry in self.objects)) > MAX_INSTANCES:
+            raise FieldError(
+                "objects", f"must be at most {MAX_INSTANCES} in a layout, as ids have 16 bits (got {total})"
+            )
         self._check_focal_length()
         drawn, stated = self.randomise.white_balance, self.composite.white_balance
         if stated not in ("auto", DAYLIGHT) and drawn != (DAYLIGHT, DAYLIGHT):

@@ -29,6 +29,16 @@ def lowest(mesh: trimesh.Trimesh, pose: NDArray[np.float64]) -> float:
     return float((mesh.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2].min())
 
 
+def scanned_box(size=(0.12, 0.16, 0.04), *, dent=3e-4, noise=1e-4, points=6000, seed=0):
+    """Return the convex hull of noisy points on a box, whose sides are dented [m]: as the scan of a package."""
+    box = trimesh.creation.box(size)
+    places, faces = trimesh.sample.sample_surface(box, points, seed=seed)
+    normals = box.face_normals[faces]
+    depths = dent * np.prod(np.where(normals == 0, 1 - (2 * places / size) ** 2, 1.0), axis=1)
+    heights = np.random.default_rng(seed).normal(0, noise, points) - depths
+    return trimesh.convex.convex_hull(places + normals * heights[:, None])
+
+
 def body_of(*pieces, density=3000.0, **material):
     """Return a body of convex pieces with a contact material."""
     from mitsplat.physics.friction import ContactMaterial

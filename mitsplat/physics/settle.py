@@ -35,6 +35,7 @@ _PHYSICS_MODULES = (
 )
 MODULES = (
     "geometry.decomposition",
+    "geometry.hull_facets",
     "geometry.hull_fit",
     "geometry.mesh",
     "geometry.mesh_distance",

@@ -51,9 +51,9 @@ CROWDED = "no room for all"
 _LEFT_OUT_PER_ROUND = 0.1  # share of the objects that is left out per round if they find no room,
 _MAX_LEFT_OUT = 0.5  # and maximum share in total: beyond it, the region is too small
 _POUR_SPEED = 1.0  # speed limit of poured objects [m/s]: at higher speed, heavy objects eject light ones
-# Simulated time for the draws of a layout [s], ten times that of a typical draw. After it, each rejected draw leaves
-# objects out.
-_MAX_SIMULATED = 40.0
+# Simulated time for the draws of a layout [s], five times that of a pile of thirty packages. After it, each rejected
+# draw leaves objects out.
+_MAX_SIMULATED = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class Drop:
 
         After ``settle.attempts`` rejected draws, the objects that caused every rejection are left out. If there are
         none, the object that caused most rejections is left out. The remaining objects are drawn again. Once the draws
-        of a layout have simulated 40 s, every rejected draw leaves out objects. If objects find no room beside one
+        of a layout have simulated 20 s, every rejected draw leaves out objects. If objects find no room beside one
         another, the last of them are left out.
 
         Raises:

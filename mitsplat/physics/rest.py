@@ -35,7 +35,8 @@ _DRAG_TIME = 0.2  # time constant of the drag on bodies that still move after FR
 # Bodies are late if they roll or rock while the others rest: they move by more than a limit [m] within a time [s]. At
 # least one body may be late, and at most this share of all.
 _LATE_MOTION, _LATE_TIME, _MAX_LATE = 1e-3, 1.0, 0.5
-_MAX_REDRAWS = 8  # of bodies, in one drop
+# Time after the handling in which failed bodies start again [s], twice that of a typical pile of thirty packages.
+_REDRAW_TIME = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +96,8 @@ def run_to_rest(
     Bodies that still move after 1.5 s no longer rebound, and are slowed by a drag with a time constant of 0.2 s, which
     ends together with rolling friction. A body fails if it leaves the bounds or leans against a wall. It also fails if
     it still moves after half of the bodies, or all but one, have moved by less than 1 mm for a second. With ``redraw``,
-    failed bodies start again from new poses, up to eight times, while the others stay where they are. Otherwise, the
-    drop is rejected.
+    bodies that fail in the first six seconds start again from new poses, while the others stay where they are.
+    Otherwise, the drop is rejected.
 
     Args:
         world: Simulation; changed in place.
@@ -141,7 +142,7 @@ def _run_to_rest(
     mean_frames = max(1, round(_SPEED_WINDOW / world.interval))
     past: deque[Float64Array] = deque([world.poses], maxlen=mean_frames + 1)
     begin, since, rest = handling.end, 0.0, world.poses
-    motion, redraws = np.zeros(len(world.bodies)), 0
+    motion = np.zeros(len(world.bodies))
     while world.time - since < _REST_TIME:
         quiet = world.time - since >= _QUIET_TIME
         world.set_rolling_friction(not (world.time - begin < free_time or quiet))
@@ -158,12 +159,13 @@ def _run_to_rest(
         if not failed.any() and since - begin >= max_time:
             reason, failed = f"not at rest within {max_time:g} s", moving
         if failed.any():
-            drawn = redraw(poses, failed) if redraw is not None and redraws < _MAX_REDRAWS else None
+            in_time = world.time < handling.end + _REDRAW_TIME
+            drawn = redraw(poses, failed) if redraw is not None and in_time else None
             if drawn is None:
                 raise _Rejected(reason, failed)
             _restart(world, drawn, failed)
             begin, since = max(world.time, handling.end), world.time
-            rest, motion, redraws = drawn, np.zeros(len(world.bodies)), redraws + 1
+            rest, motion = drawn, np.zeros(len(world.bodies))
         observe(world.time, rest if failed.any() else poses, failed)
     speed, spin = _mean_speeds(world.bodies, past[0], poses, (len(past) - 1) * world.interval)
     return RestOutcome("", since, speed, spin, float(motion.max()), world.poses)

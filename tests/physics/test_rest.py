@@ -220,3 +220,27 @@ def test_a_body_that_fails_starts_again_while_the_others_stay(leans, reason):
     np.testing.assert_allclose(outcome.poses[:4], before[:4], atol=1e-4)
     assert outcome.poses[4, 0, 3] == pytest.approx(before[4, 0, 3] - 0.05, abs=1e-3)
     assert outcome.time > time
+
+
+def test_a_body_that_never_rests_starts_again_for_six_seconds():
+    """One of five blocks without friction moves at 10 mm/s after each new start, and fails 2.5 s later."""
+    from mitsplat.physics.rest import LATE, run_to_rest
+
+    block = body_of(trimesh.creation.box((0.02, 0.02, 0.01)), friction=0.0)
+    start = np.stack([pose_at((0.1, 0.1 * i - 0.2, 0.005)) for i in range(5)])
+    world = world_of("mujoco", [block] * 5, [table(friction=0.0)], start)
+    times = []
+
+    def push(time, poses, again):
+        velocities = world.velocities
+        velocities[4, 0] = (0.01, 0, 0)
+        world.set_velocities(velocities)
+
+    def redraw(poses, failed):
+        times.append(world.time)
+        return start
+
+    outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE, redraw=redraw, observe=push)
+    assert (outcome.rejection, outcome.causes) == (LATE, (4,))
+    assert times == pytest.approx([2.5, 5.0], abs=0.05)
+    assert outcome.time == pytest.approx(7.5, abs=0.1)

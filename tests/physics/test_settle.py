@@ -323,7 +323,7 @@ def test_objects_that_fall_off_are_dropped_again_while_the_others_stay(pedestal_
 def test_drops_that_fall_off_are_rejected_and_counted(pedestal_scene, monkeypatch):
     from mitsplat.physics import rest
 
-    monkeypatch.setattr(rest, "_MAX_REDRAWS", 0)
+    monkeypatch.setattr(rest, "_REDRAW_TIME", 0.0)
     scene = pedestal_scene
     certificates = [settle_layout(scene, index, cached=False).certificate for index in range(3)]
     refused = [reason for certificate in certificates for reason in certificate.refused]

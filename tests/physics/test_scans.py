@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("physics")
 @pytest.mark.parametrize("stepper", ["mujoco", pytest.param("warp", marks=pytest.mark.extended)])
 @pytest.mark.parametrize("degrees", [0, 15])
 def test_a_stack_of_scanned_boxes_does_not_creep(stepper, degrees):
-    """Three boxes, one turned against the other, move by less than 0.1 mm in a second; they slide from 27 degrees on."""
+    """Three boxes, turned against one another, move by less than 0.1 mm in a second. They slide from 27 degrees on."""
     from mitsplat.physics.bodies import make_body
     from mitsplat.physics.rest import surface_motion
 

@@ -17,6 +17,7 @@ from mitsplat.renderer.rays.device_arrays import wrapped
 
 SURVEY_LATTICE = (233, 144)
 OPEN_LATTICE = (34, 21)
+ROUGH_LATTICE = (8, 5)
 SPHERE_LATTICE = (4181, 2584)
 """Number of points and generator of Fibonacci lattices. Consecutive Fibonacci numbers give the best two-dimensional
 lattices (Niederreiter 1992, section 5.3).
@@ -219,14 +220,16 @@ class Emitters:
         outside.wi = -direction
         return mi.Color3f(emitter.eval(outside, active))
 
-    def unoccluded_irradiance(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
-        """Compute the unoccluded irradiance (Color3f) from one fixed set of directions."""
+    def unoccluded_irradiance(
+        self, si: mi.SurfaceInteraction3f, active: mi.Bool, lattice: tuple[int, int] = OPEN_LATTICE
+    ) -> mi.Color3f:
+        """Compute the unoccluded irradiance (Color3f) from one fixed set of directions, those of a ``lattice``."""
         total = mi.Color3f(0)
         if self.local_choice is not None:
-            choice, rounds = self.local_choice, dr.opaque(mi.UInt32, OPEN_LATTICE[0])
+            choice, rounds = self.local_choice, dr.opaque(mi.UInt32, lattice[0])
 
             def add(i: mi.UInt32, total: mi.Color3f) -> tuple[mi.UInt32, mi.Color3f]:
-                point = lattice_point(i, OPEN_LATTICE)
+                point = lattice_point(i, lattice)
                 index, x, chance = choice.sample(point.x)
                 direction, _, radiance, _ = self._towards(si, index, mi.Point2f(x, point.y), active)
                 cosine = dr.maximum(dr.dot(si.sh_frame.n, direction), 0)
@@ -234,7 +237,7 @@ class Emitters:
 
             state = dr.zeros(mi.UInt32, dr.width(si.p)), dr.zeros(mi.Color3f, dr.width(si.p))
             _, total = dr.while_loop(state, lambda i, _: active & (i < rounds), add, label="open light")
-            total /= OPEN_LATTICE[0]
+            total /= lattice[0]
         if self.sky is not None:
             emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
             total += dr.pi * self.sky_colour if self.even_sky else sky_irradiance(emitter).at(si.n, active)

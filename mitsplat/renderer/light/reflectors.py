@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.emitters.emitter_sampling import Beam, Emitters, receiver
+from mitsplat.renderer.emitters.emitter_sampling import ROUGH_LATTICE, Beam, Emitters, receiver
 from mitsplat.renderer.light.light_tiles import STRIDE
 from mitsplat.renderer.materials.principled import SpecularLobe, power_weight
 from mitsplat.renderer.materials.proxy_materials import SurfaceMaterial
@@ -270,7 +270,7 @@ class Reflectors:
         ray, near, key, emitter_sample, captured, normal, lane = some
         ray.maxt = near.t
         free = ~static.intersect(ray).is_valid()
-        irradiance = self.emitters.unoccluded_irradiance(receiver(ray.o, normal), free)
+        irradiance = self.emitters.unoccluded_irradiance(receiver(ray.o, normal), free, ROUGH_LATTICE)
         albedo = dr.minimum(captured * self.white / dr.maximum(irradiance, 1e-20), 1)
         spread = dr.opaque(mi.Float, CAPTURED_SPREAD, dr.width(key))
         paths = _Paths(ray, near, key * 0x9E3779B1 + 0x85EBCA77, emitter_sample, spread, dr.select(free, albedo, 0))

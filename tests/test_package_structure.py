@@ -27,7 +27,7 @@ LAYERS = (
     ("detector", "renderer.instances"),
     ("detector.labelled_sets", "physics", "renderer.meshes"),
     ("capture.pipeline", "labels", "renderer.differentiation", "renderer.light", "scene.loading"),
-    ("capture.alignment",),
+    ("capture.alignment", "renderer.interreflection"),
     ("capture", "renderer.emitters", "renderer.occluders", "renderer.splatting", "scene.planning"),
     ("audit", "renderer.materials", "scene"),
     ("asset", "dataset.records", "renderer.projection"),

@@ -39,7 +39,8 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
 from mitsplat.renderer.light import bounce  # noqa: E402
-from mitsplat.renderer.light.light_filter import Estimate, LightFilter, LightMeans  # noqa: E402
+from mitsplat.renderer.light.light_estimate import Estimate, LightMeans  # noqa: E402
+from mitsplat.renderer.light.light_filter import LightFilter  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[2]
 SMOOTH = LightFilter.smooth

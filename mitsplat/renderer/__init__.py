@@ -10,8 +10,8 @@ The stages of one frame, called by :mod:`~mitsplat.renderer.composition.layer_re
 2. Visible meshes and lamps along them (``meshes``, ``emitters``), which limit the depth of the splats.
 3. Splats: project, list and sort by tile, and blend (``splatting``). Instances are determined by votes.
 4. The nearest proxy mesh of each ray, whose surface receives light.
-5. Light at the visible points: shadow rays, reflections and indirect light (``light``); paths for visible meshes that
-   are not diffuse (``meshes``).
+5. Light at the visible points: shadow rays, reflections and indirect light (``light``, ``interreflection``); paths for
+   visible meshes that are not diffuse (``meshes``).
 6. Colours times light, composed by visibility (``composition``).
 7. Further rays at borders between instances (``instances``).
 """

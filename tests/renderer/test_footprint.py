@@ -12,7 +12,8 @@ import trimesh
 
 from mitsplat.renderer.layers import make_integrator, make_splats_shape
 from mitsplat.renderer.light import light_points as footprint
-from mitsplat.renderer.light.light_filter import GAIN, SMALL_FILTER_PIXELS, Estimate, LightFilter
+from mitsplat.renderer.light.light_estimate import Estimate
+from mitsplat.renderer.light.light_filter import GAIN, SMALL_FILTER_PIXELS, LightFilter
 from mitsplat.renderer.light.light_points import OFFSETS
 from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.rays.camera_rays import CameraView

@@ -18,7 +18,8 @@ from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_light import WHITE_SKY, nothing
 
 ensure_variant()
-from mitsplat.renderer.light.light_filter import Estimate, LightFilter  # noqa: E402
+from mitsplat.renderer.light.light_estimate import Estimate  # noqa: E402
+from mitsplat.renderer.light.light_filter import LightFilter  # noqa: E402
 from mitsplat.renderer.light.light_planes import SAMPLES, Planes, between_samples  # noqa: E402
 from mitsplat.renderer.light.light_tiles import BLOCK  # noqa: E402
 from mitsplat.renderer.light.lit_surface import LitSurface  # noqa: E402

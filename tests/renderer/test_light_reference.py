@@ -188,8 +188,8 @@ def test_material_takes_direct_light_reflected_light_and_mirrored_light(pictures
 def test_number_of_rays_is_doubled_until_it_is_the_wanted_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """The number is rounded down for each of several sample points of a pixel."""
     ensure_variant()
-    from mitsplat.renderer.light.light import Accuracy
     from mitsplat.renderer.light.light_filter import LightFilter
+    from mitsplat.renderer.light.lighting import Accuracy
 
     seen: dict[str, Array] = {}
     rays_for, smooth = LightFilter.rays_for, LightFilter.smooth

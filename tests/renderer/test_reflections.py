@@ -297,7 +297,7 @@ def test_mirror_shows_captured_colours_of_its_directions() -> None:
 def test_object_before_a_wall_blocks_the_light_of_the_wall_and_not_of_the_sky(wall: float) -> None:
     """A captured wall of radiance L hides half of a sky of radiance 1, and a black screen the wall.
 
-    The floor, which a metal plate mirrors, loses L / (1 + L) of its light. :meth:`Reflectors._arriving_share` gives
+    The floor, which a metal plate mirrors, loses L / (1 + L) of its light. :meth:`CapturedHits.arriving_share` gives
     L / 2, because it chooses directions by the light of the sky alone.
     """
     make_integrator()

@@ -19,7 +19,8 @@ from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneCo
 from mitsplat.renderer.instances.antialiasing import Edges
 from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
 from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes, with_area_beyond
-from mitsplat.renderer.light.light import Accuracy, light_factor
+from mitsplat.renderer.light.light import light_factor
+from mitsplat.renderer.light.lighting import Accuracy
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
 from mitsplat.renderer.meshes.mesh_radiance import PathTracer
 from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters

@@ -17,9 +17,12 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.light_filter import RADIUS, Estimate, LightFilter
+from mitsplat.renderer.interreflection.captured_hits import MIN_COVER
+from mitsplat.renderer.interreflection.reflectors import Reflectors
+from mitsplat.renderer.light.light_estimate import Estimate
+from mitsplat.renderer.light.light_filter import RADIUS, LightFilter
+from mitsplat.renderer.light.light_tiles import STRIDE
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
-from mitsplat.renderer.light.reflectors import MIN_COVER, Reflectors
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
 from mitsplat.renderer.rays.device_arrays import gathered
 
@@ -120,7 +123,7 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
         start = tracer.start_at(cell % cells.width, cell // cells.width) if in_cells else tracer.sequence_start(number)
         origin, normal = mi.Point3f(ray_origin(own)), mi.Vector3f(own.normal)
         dr.eval(own, start, origin, normal, cell)
-        found, without, nearness = reflectors.irradiance(origin, normal, start, rays, _two_points)
+        found, without, nearness = reflectors.irradiance(origin, normal, start, STRIDE, rays, _two_points)
         if in_cells:
             values = [*found, *without, dr.sum(found) * nearness]
             *means, near = LightFilter(own, cells, cell).average(values)

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.emitters.emitter_sampling import Emitters
-from mitsplat.renderer.light.light_filter import Estimate
+from mitsplat.renderer.light.light_estimate import Estimate
 from mitsplat.renderer.light.light_tiles import BLOCK
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
 from mitsplat.renderer.light.shadow_rays import ShadowTracer

@@ -15,7 +15,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.renderer.light.light_filter import UNTRACED, Estimate
+from mitsplat.renderer.light.light_estimate import Estimate
+from mitsplat.renderer.light.light_filter import UNTRACED
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
 from mitsplat.renderer.light.reflections import Reflections
 from mitsplat.renderer.rays.camera_rays import CameraView

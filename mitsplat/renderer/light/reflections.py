@@ -1,9 +1,9 @@
 """Reflection rays: light that surfaces, lamps and the sky send into the specular lobe of visible points.
 
 Each ray samples the visible microfacet normals of the point. It ends at an emitter or at the nearest surface, whose
-outgoing light is that of :class:`mitsplat.renderer.light.reflectors.Reflectors`. Light of emitters is weighted by the
-power heuristic against the shadow rays, which sample the emitters (Veach 1997, section 9.2.4). The number of rays
-follows the variance of the first rays, as for shadow rays.
+outgoing light is that of :class:`mitsplat.renderer.interreflection.reflectors.Reflectors`. Light of emitters is
+weighted by the power heuristic against the shadow rays, which sample the emitters (Veach 1997, section 9.2.4). The
+number of rays follows the variance of the first rays, as for shadow rays.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.emitters.emitter_sampling import receiver
+from mitsplat.renderer.interreflection.reflectors import LANES, Reflectors
 from mitsplat.renderer.light.light_filter import LightFilter, packed
-from mitsplat.renderer.light.reflectors import LANES, Reflectors
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
 from mitsplat.renderer.materials.principled import power_weight, typical_brightness
 from mitsplat.renderer.rays.device_arrays import concatenated, gathered

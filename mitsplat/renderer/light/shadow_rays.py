@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.emitters.emitter_sampling import Beam, Emitters, receiver
-from mitsplat.renderer.light.light_filter import Estimate, packed
+from mitsplat.renderer.light.light_estimate import Estimate
+from mitsplat.renderer.light.light_filter import packed
 from mitsplat.renderer.light.light_tiles import BLOCK, STRIDE, ShadowTiles, block_order, parity
 from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.materials.principled import power_weight, typical_brightness

@@ -8,17 +8,27 @@ and the light of one further ray, which ends at the next surface.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.emitters.emitter_sampling import ROUGH_LATTICE, Beam, Emitters, receiver
-from mitsplat.renderer.light.light_tiles import STRIDE
+from mitsplat.renderer.emitters.emitter_sampling import Beam, Emitters, receiver
+from mitsplat.renderer.interreflection.captured_hits import CapturedHits
+from mitsplat.renderer.interreflection.ray_paths import (
+    Paths,
+    end_kernel,
+    lifted,
+    occluded,
+    place_on,
+    sequence_number,
+    shadow_ray,
+    towards,
+)
 from mitsplat.renderer.materials.principled import SpecularLobe, power_weight
 from mitsplat.renderer.materials.proxy_materials import SurfaceMaterial
 from mitsplat.renderer.materials.radiance_grid import RadianceGrid
-from mitsplat.renderer.occluders.proxies import Boxes, OccluderScene, Proxies, TraceScene
+from mitsplat.renderer.occluders.proxies import Proxies, TraceScene
 from mitsplat.renderer.rays.device_arrays import gathered
 
 LANES = 1 << 20
@@ -27,28 +37,11 @@ LANES = 1 << 20
 BOUNCES = 2
 """Number of objects along a path. The last one is diffuse: a metal then reflects the mean of the light around it."""
 
-MIN_COVER = 0.03
-"""Share of the hemisphere that an object covers from which its light on captured surroundings is traced."""
-
-CANDIDATES = 4
-"""Sampled emitters of which one is tested for the shadow of dynamic objects on captured surroundings."""
-
 MIN_LAMP_ROUGHNESS = 0.3
 """Roughness above which the emitters that plastics mirror are added. On smoother surfaces they are rare and bright."""
 
-RICHTMYER = tuple(int(2**32 * (prime**0.5 % 1)) | 1 for prime in (2, 3, 5, 7, 11))
-"""Additive recurrence with square roots of primes, in units of 2^-32 (Richtmyer 1951, "The evaluation of definite
-integrals, and a quasi-Monte Carlo method based on the properties of algebraic numbers").
-
-Neighbours share few directions, so that random numbers would leave a common error of 10 % in the light of an umbra.
-With this sequence it is 3 %.
-"""
-
 DIFFUSE_SPREAD = 0.5
 """GGX's alpha of a diffuse reflection in :func:`widened`."""
-
-CAPTURED_SPREAD = 0.25
-"""This alpha for light of objects on captured surroundings, where a metal below a lamp lights a small area."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,32 +68,6 @@ class _Point:
     def metal(self) -> mi.Bool:
         """True for metals, which mirror the further ray."""
         return self.surface.metallic > 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class _Paths:
-    """Rays that end at objects or visible meshes.
-
-    Attributes:
-        ray: The rays.
-        hit: Their ends.
-        key: Integer per ray, which selects its points of a low-discrepancy sequence.
-        emitter_sample: Point of the unit square per ray that selects an emitter.
-        spread: GGX's alpha of the lobe that reflects the light of each ray.
-        weight: Share (Color3f) of the light that is seen; 1 for rays that are not reflected again.
-    """
-
-    ray: mi.Ray3f
-    hit: mi.PreliminaryIntersection3f
-    key: mi.UInt32
-    emitter_sample: mi.Point2f
-    spread: mi.Float
-    weight: mi.Color3f
-
-    def set(self, lane: mi.UInt32, others: _Paths) -> None:
-        """Replace the paths ``lane`` in place."""
-        for field in fields(self):
-            dr.scatter(getattr(self, field.name), getattr(others, field.name), lane)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +100,7 @@ class Reflectors:
         origin: mi.Point3f,
         normal: mi.Vector3f,
         start: mi.UInt32,
+        step: int,
         rays: int,
         sequence: Callable[[mi.UInt32], tuple[mi.Point2f, mi.Point2f]],
     ) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
@@ -142,6 +110,7 @@ class Reflectors:
             origin: Ray origins [m].
             normal: Unit normal of the surface.
             start: Sequence number of the first ray of every point.
+            step: Difference between the numbers of two rays of a point.
             rays: Number of rays per point.
             sequence: Function that maps ray numbers to two points of the unit square.
 
@@ -157,7 +126,7 @@ class Reflectors:
             some = min(together, rays - first)
             lane = dr.arange(mi.UInt32, count * some)
             row = lane // dr.opaque(mi.UInt32, some)
-            number = dr.gather(mi.UInt32, start, row) + (lane - row * some + dr.opaque(mi.UInt32, first)) * STRIDE
+            number = dr.gather(mi.UInt32, start, row) + (lane - row * some + dr.opaque(mi.UInt32, first)) * step
             upward, emitter_sample = sequence(number)
             frame = mi.Frame3f(dr.gather(mi.Vector3f, normal, row))
             towards = frame.to_world(mi.warp.square_to_cosine_hemisphere(upward))
@@ -215,14 +184,15 @@ class Reflectors:
         boxes = self.proxies.boxes if bounces > 1 and dynamic.materials is not None else None
         weight = mi.Color3f(1) if boxes is None else dr.full(mi.Color3f, 1, dr.width(key))
         dr.eval(near, colour, captured, hits_object, distance, has_colour, weight)
-        paths = _Paths(ray, near, key, emitter_sample, spread, weight)
+        paths = Paths(ray, near, key, emitter_sample, spread, weight)
         lane = dr.compress(has_colour)
         if static is not None and dr.width(lane):
             seen, number, light_sample = (dr.gather(type(v), v, lane) for v in (captured, key, emitter_sample))
-            place = _place_on(static, dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, triangle, lane))
-            share = self._arriving_share(static, place, number, light_sample)
+            place = place_on(static, dr.gather(mi.Ray3f, ray, lane), dr.gather(mi.UInt32, triangle, lane))
+            hits = CapturedHits(static, self.grid, self.proxies, self.emitters, self.white)
+            share = hits.arriving_share(place, number, light_sample)
             dr.scatter(colour, seen * share, lane)
-            onward = None if boxes is None else self._paths_from_captures(static, dynamic, boxes, place, seen, number)
+            onward = None if boxes is None else hits.paths_to_objects(dynamic, boxes, place, seen, number)
             if onward is not None:
                 lane = dr.gather(mi.UInt32, lane, onward[0])
                 paths.set(lane, onward[1])
@@ -234,103 +204,7 @@ class Reflectors:
         dr.eval(colour)
         return colour, captured, distance
 
-    def _paths_from_captures(
-        self,
-        static: TraceScene,
-        dynamic: TraceScene,
-        boxes: Boxes,
-        place: mi.SurfaceInteraction3f,
-        captured: mi.Color3f,
-        key: mi.UInt32,
-    ) -> tuple[mi.UInt32, _Paths] | None:
-        """Return paths from captured surfaces to objects that light them, and their lanes; None if there are none.
-
-        The captured colour is albedo * E / white with the irradiance E of the emitters, so that
-
-            added colour = min(captured * white / E, 1) * mean colour of objects over the cosine-weighted hemisphere
-        """
-        near_objects = boxes.form_factor(place.p, place.n) > MIN_COVER
-        dr.eval(place.p, place.n, near_objects)
-        lane = dr.compress(near_objects)
-        if not dr.width(lane):
-            return None
-        captured, origin, normal, key = (dr.gather(type(v), v, lane) for v in (captured, place.p, place.n, key))
-        numbers = [_sequence_number(key, dimension) for dimension in range(4)]
-        upward = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*numbers[:2]))
-        ray, emitter_sample = mi.Ray3f(origin, mi.Frame3f(normal).to_world(upward)), mi.Point2f(*numbers[2:])
-        if self.emitters.sky is not None:
-            ray.maxt = self.emitters.sky_reach
-        near = dynamic.intersect(ray)
-        hits_object = near.is_valid()
-        dr.eval(ray, near, hits_object, emitter_sample)
-        row = dr.compress(hits_object)
-        if not dr.width(row):
-            return None
-        some = (dr.gather(type(v), v, row) for v in (ray, near, key, emitter_sample, captured, normal, lane))
-        ray, near, key, emitter_sample, captured, normal, lane = some
-        ray.maxt = near.t
-        free = ~static.intersect(ray).is_valid()
-        irradiance = self.emitters.unoccluded_irradiance(receiver(ray.o, normal), free, ROUGH_LATTICE)
-        albedo = dr.minimum(captured * self.white / dr.maximum(irradiance, 1e-20), 1)
-        spread = dr.opaque(mi.Float, CAPTURED_SPREAD, dr.width(key))
-        paths = _Paths(ray, near, key * 0x9E3779B1 + 0x85EBCA77, emitter_sample, spread, dr.select(free, albedo, 0))
-        dr.eval(lane, paths)
-        return lane, paths
-
-    def _arriving_share(
-        self, static: TraceScene, place: mi.SurfaceInteraction3f, key: mi.UInt32, emitter_sample: mi.Point2f
-    ) -> mi.Float:
-        """Return the share of light that dynamic objects leave at captured surfaces, from one sampled emitter.
-
-        The sample is chosen from several in proportion to its irradiance (Talbot et al. 2005, "Importance Resampling
-        for Global Illumination"). Where a captured wall hides the sky, objects block the light of the wall instead, at
-        most that of the sky. Walls do not change the chances of directions: shadows are too weak where dark walls hide
-        much of the sky.
-        """
-
-        def choose(
-            i: mi.UInt32, rest: mi.Float, total: mi.Float, direction: mi.Vector3f, reach: mi.Float, sky: mi.Bool
-        ) -> tuple[mi.UInt32, mi.Float, mi.Float, mi.Vector3f, mi.Float, mi.Bool]:
-            x = emitter_sample.x + mi.Float(i) / CANDIDATES
-            beam = self.emitters.sample(place, mi.Point2f(x - dr.floor(x), emitter_sample.y), mi.Bool(True))
-            weight, before = dr.sum(beam.irradiance), total
-            total = before + weight
-            scaled = rest * total
-            chosen = scaled < weight
-            # The rest of the number is uniform again in either case.
-            rescaled = dr.select(chosen, scaled / weight, (scaled - weight) / before)
-            return (
-                i + 1,
-                dr.select((weight > 0) & (before > 0), rescaled, rest),
-                total,
-                dr.select(chosen, beam.direction, direction),
-                dr.select(chosen, beam.reach, reach),
-                dr.select(chosen, beam.sky, sky),
-            )
-
-        count, last = dr.width(key), dr.opaque(mi.UInt32, CANDIDATES)
-        nothing = (dr.zeros(kind, count) for kind in (mi.Float, mi.Vector3f, mi.Float, mi.Bool))
-        state = dr.zeros(mi.UInt32, count), _sequence_number(key, 4), *nothing
-        state = dr.while_loop(state, lambda i, *_: i < last, choose, label="candidates")
-        _, _, total, direction, reach, sky = state
-        shadow, shaded = _shadow_ray(place.p, direction, reach), total > 0
-        self._end_kernel(shadow, key, shaded, sky)
-        shaded &= self._occluded(shadow, mi.UInt32(0), key, shaded, self.proxies.shadow_casters)
-        wall = static.intersect(shadow, shaded)
-        blocked = shaded & wall.is_valid()
-        shadow.maxt = dr.select(blocked, wall.t, shadow.maxt)
-        self._end_kernel(shadow, blocked, shaded)
-        behind = self._occluded(shadow, mi.UInt32(0), key, blocked & sky, self.proxies.shadow_casters)
-        lost = dr.select(shaded & ~blocked, mi.Float(1), 0)
-        if self.emitters.sky is not None and self.grid is not None:
-            of_wall = self.grid.at(shadow, dr.select(behind, shadow.maxt, 0), behind) * self.white
-            emitter = dr.gather(mi.EmitterPtr, self.emitters.pointers, self.emitters.sky)
-            of_sky = dr.pi * self.emitters.sky_radiance(place, direction, emitter, behind)
-            lost = dr.select(behind, dr.minimum(dr.sum(of_wall) / dr.maximum(dr.sum(of_sky), 1e-20), 1), lost)
-        dr.eval(lost)
-        return 1 - lost
-
-    def _reflected(self, bounces: int, paths: _Paths) -> mi.Color3f:
+    def _reflected(self, bounces: int, paths: Paths) -> mi.Color3f:
         """Return the colour (Color3f) of objects and visible meshes: reflected light of one emitter and one ray."""
         dynamic = self.proxies.dynamic
         if dynamic is None:
@@ -356,8 +230,8 @@ class Reflectors:
             normal = dr.select(visible, si.n, normal)
             diffuse = (si.bsdf().flags() & int(mi.BSDFFlags.DiffuseReflection)) != 0
             colour = dr.select(visible, si.bsdf().eval_diffuse_reflectance(si, diffuse & visible), colour)
-        normal = _towards(normal, ray)
-        origin = _lifted(ray(hit.t), normal)
+        normal = towards(normal, ray)
+        origin = lifted(ray(hit.t), normal)
         if spread is None:
             return _Point(origin, normal, instance, surface, colour, None)
         roughness = widened(surface.roughness, spread)
@@ -371,14 +245,14 @@ class Reflectors:
         if point.lobe is not None:
             cosine = dr.dot(point.normal, beam.direction)
             lit += self._mirrored_emitter(point.lobe, point.surface, beam, cosine, point.metal)
-        shadow, free = _shadow_ray(point.origin, beam.direction, beam.reach), dr.max(lit) > 0
-        self._end_kernel(lit, shadow, key, free, point.instance)
-        free &= ~self._occluded(shadow, point.instance, key, free, self.proxies.occluder_scenes)
+        shadow, free = shadow_ray(point.origin, beam.direction, beam.reach), dr.max(lit) > 0
+        end_kernel(self.proxies, lit, shadow, key, free, point.instance)
+        free &= ~occluded(self.proxies, shadow, point.instance, key, free, self.proxies.occluder_scenes)
         return dr.select(free, lit, 0)
 
     def _with_onward_light(self, lit: mi.Color3f, point: _Point, key: mi.UInt32, bounces: int) -> mi.Color3f:
         """Add the light (Color3f) of one further ray per point: mirrored on metals, diffuse on other materials."""
-        numbers = [_sequence_number(key, dimension) for dimension in range(4)]
+        numbers = [sequence_number(key, dimension) for dimension in range(4)]
         sample, other = mi.Point2f(*numbers[:2]), mi.Point2f(*numbers[2:])
         direction = mi.Frame3f(point.normal).to_world(mi.warp.square_to_cosine_hemisphere(sample))
         throughput, density = mi.Color3f(point.albedo), mi.Float(0)
@@ -424,26 +298,6 @@ class Reflectors:
         used = (cosine > 0) & (metal | (lobe.alpha >= MIN_LAMP_ROUGHNESS**2))
         return dr.select(used, reflectance * beam.irradiance * (weight / self.white), 0)
 
-    def _occluded(
-        self,
-        ray: mi.Ray3f,
-        instance: mi.UInt32,
-        key: mi.UInt32,
-        active: mi.Bool,
-        occluder_scenes: tuple[OccluderScene, ...],
-    ) -> mi.Bool:
-        """Return True for rays that any of some scenes occludes."""
-        free = active
-        for occluder_scene in occluder_scenes:
-            free = free & ~occluder_scene.occluded(ray, instance, key, free)
-            self._end_kernel(free)
-        return active & ~free
-
-    def _end_kernel(self, *values: object) -> None:
-        """Evaluate values before the next scene is traced, if a kernel may trace only one scene."""
-        if self.proxies.separate_kernels:
-            dr.eval(values)
-
 
 def widened(roughness: mi.Float, spread: mi.Float) -> mi.Float:
     """Return the roughness of a surface that another lobe of GGX's alpha ``spread`` mirrors.
@@ -453,30 +307,3 @@ def widened(roughness: mi.Float, spread: mi.Float) -> mi.Float:
     (Kaplanyan and Dachsbacher 2013, "Path Space Regularization for Holistic and Robust Light Transport").
     """
     return dr.sqrt(dr.sqrt(dr.power(roughness, 4) + dr.square(spread)))
-
-
-def _place_on(scene: TraceScene, ray: mi.Ray3f, triangle: mi.UInt32) -> mi.SurfaceInteraction3f:
-    """Return the places where rays end at triangles, lifted off the surface."""
-    normal = _towards(scene.normal_at(triangle, mi.Bool(True)), ray)
-    return receiver(_lifted(ray(ray.maxt), normal), normal)
-
-
-def _towards(normal: mi.Normal3f, ray: mi.Ray3f) -> mi.Normal3f:
-    """Return normals towards the origin of rays."""
-    return dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
-
-
-def _lifted(point: mi.Point3f, normal: mi.Normal3f) -> mi.Point3f:
-    """Return points [m] off a surface by Mitsuba's distance for spawned rays."""
-    return point + normal * ((1 + dr.max(dr.abs(point))) * mi.math.RayEpsilon)
-
-
-def _shadow_ray(origin: mi.Point3f, direction: mi.Vector3f, reach: mi.Float) -> mi.Ray3f:
-    ray = mi.Ray3f(origin, direction)
-    ray.maxt = reach * (1 - 1e-3)
-    return ray
-
-
-def _sequence_number(key: mi.UInt32, dimension: int) -> mi.Float:
-    """Return a number in [0, 1) per key: a coordinate of :data:`RICHTMYER`."""
-    return mi.Float((key * RICHTMYER[dimension]) >> 8) * 2.0**-24

@@ -14,6 +14,8 @@ _MIN_JUDGED = 100
 """Number of Gaussians from which their values show how they are encoded."""
 _MIN_SPREAD = 0.7
 """Range of stored opacities from which those from 0 to 1 are no logits."""
+_MIN_VALUES = 10
+"""Number of different opacities from which whole numbers are no logits. Splats of a program may have one logit, 4."""
 _MAX_COEFFICIENT = 10.0
 """Median of constant coefficients above which they are no colours: 1.8 is white."""
 _EQUAL_COLOURS = 6.0
@@ -38,7 +40,7 @@ def check_encoding(means: Float32Array, scales: Float32Array, opacities: Float32
     * All Gaussians are larger than one unit, and most of them are as large as the cloud, or one is 100 times as large.
     * Only the third scale is the same for all Gaussians, and it is larger than most of the others.
     * The coefficients are as large as colours from 0 to 255.
-    * All opacities are whole numbers from 0 up, as of bytes or percent.
+    * All opacities are whole numbers from 0 up, as of bytes or percent, with several values.
     """
     if len(scales) < _MIN_JUDGED:
         return
@@ -49,7 +51,8 @@ def check_encoding(means: Float32Array, scales: Float32Array, opacities: Float32
             f"{scales.min():.3g} to {scales.max():.3g}, and {low:.3g} to {high:.3g}): apply log "
             "to the scales and log(o / (1 - o)) to the opacities"
         )
-    if low >= 0 and high > 1 and np.isfinite(high) and np.array_equal(opacities, np.rint(opacities)):
+    is_whole = low >= 0 and high > 1 and np.isfinite(high) and np.array_equal(opacities, np.rint(opacities))
+    if is_whole and len(np.unique(opacities)) >= _MIN_VALUES:
         raise InputError(
             f"opacity of a PLY file must be logits (got whole numbers from {low:.0f} to {high:.0f}): divide them by "
             "their maximum (255 or 100), and apply log(o / (1 - o))"

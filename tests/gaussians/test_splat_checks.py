@@ -42,6 +42,14 @@ def test_whole_numbers_are_no_logits(tmp_path: Path, kind: str, top: int) -> Non
         Splats.load(tmp_path / "a.ply")
 
 
+@pytest.mark.parametrize("logits", [[4], [0, 110], [0, 1, 2, 3]])
+def test_few_whole_logits_are_read(tmp_path: Path, logits: list[int]) -> None:
+    """Splats of a program often have one opacity, and files store opacities of 0.5 and 1 as 0 and 110."""
+    values = np.resize(logits, 200)
+    rewrite(tmp_path / "a.ply", {"opacity": ("float", values)})
+    np.testing.assert_allclose(Splats.load(tmp_path / "a.ply").opacities, 1 / (1 + np.exp(-values)), rtol=1e-6)
+
+
 @pytest.mark.parametrize(("wrong", "kind"), [(False, "uchar"), (False, "float"), (True, "uchar"), (True, "float")])
 def test_colours_that_contradict_the_coefficients_are_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, wrong: bool, kind: str

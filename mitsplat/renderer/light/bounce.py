@@ -4,9 +4,9 @@ Relit points receive it in addition to the light of the emitters. A captured poi
 light of the captured surroundings. The light that objects reflect and block changes it near objects, and in the shadow
 of objects it is what remains:
 
-    factor = (lit + E_with) / (base + E_without)
+    factor = (lit + B_all) / (base + B_static)
 
-with the direct irradiance ``lit`` and ``base`` with and without dynamic occluders, and the reflected irradiance with
+with the direct irradiance ``lit`` and ``base`` with and without dynamic occluders, and the reflected irradiance B with
 and without objects. Both are estimated by the same rays, so that the factor is exactly 1 where nothing changes.
 """
 

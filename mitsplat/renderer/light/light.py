@@ -3,17 +3,19 @@
 A splat stores the radiance that the camera saw, shadows included. Rendering it among new objects therefore needs no
 full light transport, but one light factor per visible point x with normal n:
 
-    captured under the scene's light:       factor = E(x, n | static and dynamic occluders) / E(x, n | static occluders)
-    captured under uniform light ("relit"): factor = (E(x, n | static and dynamic occluders) + E_bounce) / E_ref
+    "captured" under the light of the scene:   factor = (E_all + B_all) / (E_static + B_static)
+    "relit", captured under uniform light:     factor = (E_all + B_all) / white
+    "relit" with a material of metalness m:    factor = (1 - m) d (E_all + B_all) / white
 
-with irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters. The first factor is exactly 1 where no
-dynamic object takes light away, so that captured shadows are not applied twice. E_ref is the irradiance for which the
-colours of the surroundings are exposed. An object captured in a light tent keeps its colours under E_ref, and is darker
-where less light arrives. E_bounce is the light that the surroundings reflect, see
-:mod:`mitsplat.renderer.light.bounce`. A material of metalness m has the factor (1 - m) (E + E_bounce) / E_ref. Its
-specular lobe adds a tinted part to the factor and a colourless part to the highlight, see
-:mod:`mitsplat.renderer.materials.principled`. On captured colours, the highlight is reduced by the mirror image of the
-uniform light, which these colours contain; under even light it adds nothing.
+with the irradiance E = integral of V(x, w) L(w) max(0, n.w) dw over all emitters, and the irradiance B that
+surroundings and objects reflect, see :mod:`mitsplat.renderer.light.bounce`. ``all`` has static and dynamic occluders,
+``static`` has the captured surroundings alone. The first factor is exactly 1 where no dynamic object changes the light,
+so that captured shadows are not applied twice; far from objects, B is left out. ``white`` is the irradiance for which
+the colours of the surroundings are exposed. An object captured in a light tent keeps its colours under it, and is
+darker where less light arrives. d is the albedo of the diffuse term of Mitsuba's ``principled``. Its specular lobe adds
+a tinted part to the factor and a colourless part to the highlight, see :mod:`mitsplat.renderer.materials.principled`.
+On colours captured under uniform light, the highlight is reduced by the mirror image of this light, which they contain;
+under even light it adds nothing.
 
 Rays are spent adaptively. Captured surfaces get one ray per pixel where objects occlude less light than the wanted
 error, see :mod:`mitsplat.renderer.light.light_tiles`. All other points get the number of rays that most points need for
@@ -58,7 +60,9 @@ def light_factor(
     """Compute light factor and highlight (Color3f) of every visible point, see the module docstring.
 
     The stages are: search for shadows, coarse light on planes, first rays, unoccluded light, bounce, further rays,
-    filter, combination, and reflections. ``tests/renderer/light_reference.py`` computes the same quantities by loops.
+    filter, combination, reflections, and interpolation on planes. If the search finds no pixel to trace, the factor is
+    that of the search, and there is no highlight. ``tests/renderer/light_reference.py`` computes the same quantities by
+    loops.
 
     Args:
         scene: Mitsuba scene with the emitters.

@@ -181,13 +181,13 @@ class TracedPixels:
 
         With the arriving share s = lit / base, unoccluded irradiance E and metalness m:
 
-            captured:    factor = s, or (lit + E_with) / (base + E_without) near objects, see `Bounce`
-            relit:       factor = (1 - m) d (s E / white + bounce)
+            captured:    factor = s, or (lit + B_all) / (base + B_static) near objects
+            relit:       factor = (1 - m) d (s E + B_all) / white
 
         d is :func:`mitsplat.renderer.materials.principled.diffuse_albedo` of glossy materials, otherwise 1.
 
         Sums over rays are averaged over neighbours before the division, so that points with little light do not turn
-        black by chance. Sources: module docstring, and Heitz et al. 2018 as above.
+        black by chance (Heitz, Hill and McGuire 2018). :mod:`mitsplat.renderer.light.light` explains the symbols.
 
         Args:
             light: Light factor (Color3f) of untraced pixels.

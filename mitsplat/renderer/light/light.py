@@ -40,7 +40,7 @@ from mitsplat.renderer.light.unoccluded_light import UnoccludedLight
 from mitsplat.renderer.materials.radiance_grid import RadianceGrid
 from mitsplat.renderer.occluders.proxies import Proxies
 
-MIN_COVER = 0.2
+TRACED_COVER = 0.2
 """Share of the hemisphere that objects cover from which the light of captured points is traced in any case."""
 
 
@@ -134,7 +134,7 @@ def search_shadows(
             tiles = tracer.search(shadow_only)
             needed = everything.valid & (~shadow_only | tiles.differs(error))
             if cover is not None:
-                needed |= shadow_only & (cover > MIN_COVER)
+                needed |= shadow_only & (cover > TRACED_COVER)
             light = dr.select(everything.valid, tiles.light(), 1)
         codes = plane_code if some_planes else None
     others = dr.count(everything.valid & ~needed)

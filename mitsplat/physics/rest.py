@@ -32,11 +32,11 @@ Without this limit, rebounds would last longer from a restitution of about 0.75 
 """
 _SPEED_WINDOW = 0.05  # averaging time of the reported speeds [s]
 _DRAG_TIME = 0.2  # time constant of the drag on bodies that still move after FREE_TIME [s]
-# Bodies are late if they roll or rock while the others rest: they move by more than a limit [m] within a time [s]. At
-# least one body may be late, and at most this share of all.
-_LATE_MOTION, _LATE_TIME, _MAX_LATE = 1e-3, 1.0, 0.5
+# Bodies are late if they roll or rock while the others rest: they move farther than bodies at rest may within the same
+# time. At least one body may be late, and at most this share of all.
+_MAX_LATE = 0.5
 # Time after the handling in which failed bodies start again [s], twice that of a typical pile of thirty packages.
-_REDRAW_TIME = 6.0
+_REDRAW_TIME = 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +95,9 @@ def run_to_rest(
 
     Bodies that still move after 1.5 s no longer rebound, and are slowed by a drag with a time constant of 0.2 s, which
     ends together with rolling friction. A body fails if it leaves the bounds or leans against a wall. It also fails if
-    it still moves after half of the bodies, or all but one, have moved by less than 1 mm for a second. With ``redraw``,
-    bodies that fail in the first six seconds start again from new poses, while the others stay where they are.
-    Otherwise, the drop is rejected.
+    it still moves, or has moved for two seconds, after half of the bodies, or all but one, have moved by less than
+    0.5 mm for a second. With ``redraw``, bodies that fail in the first seven seconds start again from new poses, while
+    the others stay where they are. Otherwise, the drop is rejected.
 
     Args:
         world: Simulation; changed in place.
@@ -213,6 +213,7 @@ class _Failures:
         self._low, self._high = (np.broadcast_to(side, (count, 3)) for side in walls)
         self._last_motion = np.zeros(count)
         self._before: tuple[float, Float64Array] | None = None  # time and poses
+        self._moved_before = np.zeros(count, dtype=bool)  # in the second before that
         self._reach = np.array([np.linalg.norm(body.outline - body.mass.centre, axis=1).max() for body in world.bodies])
 
     def find(self, poses: Float64Array, moving: BoolArray, begin: float) -> tuple[str, BoolArray]:
@@ -244,14 +245,14 @@ class _Failures:
         """Return a mask (N,) of the bodies that move while the others rest."""
         time, late = self._world.time, np.zeros(len(calm), dtype=bool)
         if time < begin + FREE_TIME:
-            self._before = None
+            self._before, self._moved_before = None, late
         elif self._before is None:
             self._before = time, poses
-        elif time - self._before[0] >= _LATE_TIME:
-            moved = surface_motion(self._world.bodies, self._before[1], poses) > _LATE_MOTION
+        elif time - self._before[0] >= _REST_TIME:
+            moved = surface_motion(self._world.bodies, self._before[1], poses) > _REST_MOTION
             if moved.sum() <= max(1, int(_MAX_LATE * len(moved))) < len(moved):
-                late = moved & ~calm
-            self._before = time, poses
+                late = moved & (~calm | self._moved_before)
+            self._before, self._moved_before = (time, poses), moved
         return late
 
 

@@ -222,7 +222,7 @@ def test_a_body_that_fails_starts_again_while_the_others_stay(leans, reason):
     assert outcome.time > time
 
 
-def test_a_body_that_never_rests_starts_again_for_six_seconds():
+def test_a_body_that_never_rests_starts_again_for_seven_seconds():
     """One of five blocks without friction moves at 10 mm/s after each new start, and fails 2.5 s later."""
     from mitsplat.physics.rest import LATE, run_to_rest
 
@@ -244,3 +244,21 @@ def test_a_body_that_never_rests_starts_again_for_six_seconds():
     assert (outcome.rejection, outcome.causes) == (LATE, (4,))
     assert times == pytest.approx([2.5, 5.0], abs=0.05)
     assert outcome.time == pytest.approx(7.5, abs=0.1)
+
+
+def test_a_body_that_moves_in_turns_is_late_after_two_seconds():
+    """One of five blocks moves by 4 mm in each second, and rests at its end: as objects held by rolling friction."""
+    from mitsplat.physics.rest import LATE, run_to_rest
+
+    block = body_of(trimesh.creation.box((0.02, 0.02, 0.01)), friction=0.0)
+    start = np.stack([pose_at((0.1, 0.1 * i - 0.2, 0.005)) for i in range(5)])
+    world = world_of("mujoco", [block] * 5, [table(friction=0.0)], start)
+
+    def push(time, poses, again):
+        velocities = world.velocities
+        velocities[4, 0] = (0.01 if 0.2 < (time + 0.5) % 1.0 < 0.6 else 0.0, 0, 0)
+        world.set_velocities(velocities)
+
+    outcome = run_to_rest(world, max_time=6.0, bounds=EVERYWHERE, observe=push)
+    assert (outcome.rejection, outcome.causes) == (LATE, (4,))
+    assert outcome.time == pytest.approx(3.5, abs=0.05)

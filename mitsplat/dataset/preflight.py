@@ -34,8 +34,6 @@ from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, pose_matrix, walls_beside
 
-MAX_OBJECTS = 65535
-"""Maximum number of objects of a layout; instance ids have 16 bits."""
 MAX_FRAMES = 2**31 - 1
 MAX_TIME = 2000.0
 """Maximum simulated time of a layout [s]; 0.5 to 2 s of 30 objects take one second."""
@@ -101,13 +99,7 @@ def run_faults(
 
 
 def count_faults(scene: Scene) -> Iterator[Finding]:
-    """Check that the numbers of objects and images do not exceed the range of their ids."""
-    most = sum(entry.max_count for entry in scene.spec.objects)
-    if most > MAX_OBJECTS:
-        text = (
-            f"objects: a layout must have at most {MAX_OBJECTS} objects, because instance ids have 16 bits (got {most})"
-        )
-        yield _fault("count", text, "lower objects[].count")
+    """Check that the number of images does not exceed the range of their indices."""
     if scene.num_frames > MAX_FRAMES:
         text = f"output: layouts x views must be at most {MAX_FRAMES} images (got {scene.num_frames})"
         yield _fault("frames", text, "lower output.layouts or output.views")

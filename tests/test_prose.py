@@ -1,4 +1,4 @@
-"""Style of docstrings: the first line states the function of an object and does not begin with a question word."""
+"""Style of docstrings, whose first line does not begin with a question word, and length of the changelog."""
 
 from __future__ import annotations
 
@@ -33,6 +33,13 @@ def public_docstrings(path: Path) -> Iterator[tuple[int, str]]:
 def test_public_docstrings_do_not_open_with_a_question_word(path: Path) -> None:
     found = [f"{line}: {text.splitlines()[0]}" for line, text in public_docstrings(path) if QUESTION.match(text)]
     assert found == []
+
+
+def test_the_changelog_describes_a_version_on_one_page() -> None:
+    """Changes between unreleased revisions are in the history of the repository."""
+    pages = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1:]
+    assert pages
+    assert max(len(page.splitlines()) for page in pages) <= 90
 
 
 def test_a_docstring_with_a_question_word_is_found(tmp_path: Path) -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.findings import Finding
 from mitsplat.frames.light_properties import reference_point
-from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, wrapped
+from mitsplat.renderer.rays.device_arrays import plain_mesh, ray_scene, segments
 from mitsplat.runtime.dropped_rays import check_dropped_rays
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.planning.frame_lights import lights_at
@@ -45,10 +44,6 @@ def check_lamps(scene: Scene) -> Iterator[Finding]:
 
 def _blocked(surfaces: mi.Scene, start: tuple[float, float, float], ends: Float64Array) -> BoolArray:
     """Return True for ends (N, 3) [m] that a surface hides from the start [m]."""
-    ray = dr.zeros(mi.Ray3f, len(ends))
-    ray.o = mi.Point3f(*start)
-    ray.d = mi.Vector3f(*(wrapped(mi.Float, way.astype(np.float32)) for way in (ends - start).T))
-    ray.maxt = mi.Float(1.0)
-    blocked = np.array(surfaces.ray_test(ray), dtype=bool)
+    blocked = np.array(surfaces.ray_test(segments(np.broadcast_to(start, ends.shape), ends)), dtype=bool)
     check_dropped_rays()
     return np.broadcast_to(blocked, len(ends))

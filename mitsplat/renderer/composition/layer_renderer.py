@@ -26,7 +26,7 @@ from mitsplat.renderer.meshes.mesh_radiance import PathTracer
 from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters
 from mitsplat.renderer.occluders.proxies import Hit
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.rays.device_arrays import wrapped
+from mitsplat.renderer.rays.device_arrays import segments
 from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
 from mitsplat.renderer.splatting.pairs import CrowdedError
@@ -287,16 +287,8 @@ class LayerRenderer:
     def blocked(self, scene: mi.Scene, starts: Float64Array, ends: Float64Array) -> BoolArray:
         """Return True for the segments between points (N, 3) [m] that a proxy or a visible mesh intersects."""
         contents = self._contents.read(scene, self.occluders == "splats")
-        way = ends - starts
-        length = np.linalg.norm(way, axis=1)
-        ray = dr.zeros(mi.Ray3f, len(way))
-        ray.o, ray.d = (
-            type(vector)(*(wrapped(mi.Float, column.astype(np.float32)) for column in values.T))
-            for vector, values in ((ray.o, starts), (ray.d, way / np.maximum(length, 1e-12)[:, None]))
-        )
-        ray.maxt = wrapped(mi.Float, length.astype(np.float32))
-        found = np.array(contents.proxies.blocked(ray), dtype=bool)
-        return np.broadcast_to(found, len(way))
+        found = np.array(contents.proxies.blocked(segments(starts, ends)), dtype=bool)
+        return np.broadcast_to(found, len(starts))
 
     def _white(self) -> mi.Color3f:
         """Return the irradiance (Color3f) at which a white surface has the picture value 1."""

@@ -59,6 +59,19 @@ def gathered(columns: Columns, index: mi.UInt32) -> Columns:
     return type(columns)(*[v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values])
 
 
+def segments(starts: np.ndarray, ends: np.ndarray) -> mi.Ray3f:
+    """Return rays with unit directions that end at the end points; points [m] have shape (N, 3)."""
+    way = ends - starts
+    length = np.linalg.norm(way, axis=1)
+    ray = dr.zeros(mi.Ray3f, len(way))
+    ray.o, ray.d = (
+        type(vector)(*(wrapped(mi.Float, column.astype(np.float32)) for column in values.T))
+        for vector, values in ((ray.o, starts), (ray.d, way / np.maximum(length, 1e-12)[:, None]))
+    )
+    ray.maxt = wrapped(mi.Float, length.astype(np.float32))
+    return ray
+
+
 def ray_scene(contents: Mapping[str, mi.Shape], *, watertight: bool = True) -> mi.Scene:
     """Load a Mitsuba scene of ``contents`` (shapes, lights and others) with watertight triangle edges.
 

@@ -149,8 +149,13 @@ def encode_ply(splats: SplatArrays, kernel: KernelName | None = None) -> bytes:
     return header.encode() + rows.tobytes()
 
 
-def examine_columns(data: bytes) -> tuple[list[str], KernelName | None]:
-    """Return warnings of unused columns, and the kernel with which the splats were trained, if it is known."""
+def examine_columns(data: bytes, constant: Float32Array) -> tuple[list[str], KernelName | None]:
+    """Return warnings of unused columns, and the kernel with which the splats were trained, if it is known.
+
+    Args:
+        data: The file.
+        constant: Its decoded constant coefficients, shape (N, 3).
+    """
     form, elements, start = parse_ply_header(data)
     names = elements["vertex"][1].names or ()
     stated = ply_kernel(data[:start].partition(b"end_header")[0])
@@ -162,14 +167,17 @@ def examine_columns(data: bytes) -> tuple[list[str], KernelName | None]:
     if (extra := _extra_rows(data, form, elements, start)) > 0:
         stated_count = elements["vertex"][0]
         warnings.append(f"{extra} rows after the {stated_count} Gaussians that its header states are not used")
-    rows = vertex_rows(data, form, elements, start)
-    if are_colours(columns_of(rows, _COLOUR)):
+    if are_colours(constant):
         warnings.append(
             "its coefficients f_dc_0 to f_dc_2 lie in 0 to 1, which makes all colours pale: if they are colours, "
             "convert them by (c - 0.5) / 0.2821"
         )
-    if set(_COLOURS) <= set(names) and colours_differ(columns_of(rows, _COLOURS), columns_of(rows, _COLOUR)):
-        warnings.append("its columns red, green, blue differ from its coefficients f_dc_0 to f_dc_2, which are used")
+    if set(_COLOURS) <= set(names):
+        rows = vertex_rows(data, form, elements, start)
+        if colours_differ(columns_of(rows, _COLOURS), constant):
+            warnings.append(
+                "its columns red, green, blue differ from its coefficients f_dc_0 to f_dc_2, which are used"
+            )
     return warnings, stated or ("mip" if _FILTER in names else "exact" if _SCALES[2] not in names else None)
 
 

@@ -109,7 +109,8 @@ def _decode(data: bytes, suffix: str) -> tuple[SplatArrays, KernelName | None, l
         return *decode_sog(data), []
     if suffix == ".ksplat":
         return _decode_ksplat(data), None, []
-    arrays, (warnings, kernel) = decode_ply(data), examine_columns(data)
+    arrays = decode_ply(data)
+    warnings, kernel = examine_columns(data, arrays.sh[:, 0])
     return arrays, kernel, warnings
 
 

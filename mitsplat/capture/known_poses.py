@@ -12,7 +12,13 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from mitsplat.capture.name_matching import match_names
-from mitsplat.capture.nerf_transforms import Transforms, parse_transforms, read_transforms, transforms_remarks
+from mitsplat.capture.nerf_transforms import (
+    POSES_RULE,
+    Transforms,
+    parse_transforms,
+    read_transforms,
+    transforms_remarks,
+)
 from mitsplat.capture.photos import Prepared, shapes_differ, turn_upright, with_orientation
 from mitsplat.capture.structure_from_motion import SparseModel, find_points, read_colmap_model
 from mitsplat.errors import InputError
@@ -75,8 +81,8 @@ def read_poses(
     """
     by_name = {photo.name: photo for photo in photos}
     everything = [*by_name, *unusable]
-    refuse_calibration(source, "poses must be the folder of a COLMAP model or a transforms.json")
     if source.is_dir():
+        refuse_calibration(source, POSES_RULE)
         model = read_colmap_model(source, folder / "given")
         paths = {name: PurePosixPath(name.replace("\\", "/")) for name in model.cameras}
         names = match_names(source, paths, base, everything)
@@ -90,7 +96,8 @@ def read_poses(
         sizes = {name: by_name[photo].size for name, photo in names.items() if photo in by_name}
         model, sized = read_transforms(source, content, sizes)
     else:
-        raise InputError(f"{source}: poses must be the folder of a COLMAP model or a transforms.json")
+        refuse_calibration(source, POSES_RULE)
+        raise InputError(f"{source}: {POSES_RULE}")
     matched = {name: by_name[photo] for name, photo in names.items() if photo in by_name and name in model.cameras}
     if len(matched) < 2:
         first = next(iter(paths))

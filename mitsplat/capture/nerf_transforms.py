@@ -18,6 +18,7 @@ from mitsplat.storage.calibration_files import refuse_calibration
 
 _Row = tuple[float, float, float, float]
 _Positive = Annotated[float, Field(gt=0)]
+POSES_RULE = "poses must be the folder of a COLMAP model or a transforms.json"
 _MAX_RATIO = 1.03
 """Maximum ratio of the focal lengths that two keys state."""
 _UNUSED = {
@@ -77,7 +78,7 @@ def parse_transforms(path: Path) -> Transforms:
     Raises:
         InputError: If it cannot be read, repeats a key, or lacks a key or has an invalid value.
     """
-    refuse_calibration(path, "poses must be the folder of a COLMAP model or a transforms.json")
+    refuse_calibration(path, POSES_RULE)
     try:
         data = path.read_bytes()
     except FileNotFoundError:

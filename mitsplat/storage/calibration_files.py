@@ -66,10 +66,10 @@ def refuse_calibration(path: Path, wanted: str) -> None:
         InputError: If it is of such a kind; the message names the kind and how to use its content.
     """
     if path.is_dir():
-        if any((path / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+        if _is_colmap_model(path):
             return
         for folder in (path / "sparse/0", path / "0", path / "sparse"):
-            if any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+            if _is_colmap_model(folder):
                 raise InputError(f"{path}: {wanted} (got a folder without cameras.bin): did you mean {folder}?")
         files = sorted(islice((file for file in path.iterdir() if file.is_file()), _MAX_FILES))
         inside = next(((file, kind) for file in files if (kind := calibration_kind(file))), None)
@@ -78,3 +78,8 @@ def refuse_calibration(path: Path, wanted: str) -> None:
             raise InputError(f"{path}: {wanted} (got a folder with {file.name}, {name}): {remedy}")
     elif path.is_file() and (kind := calibration_kind(path)):
         raise InputError(f"{path}: {wanted} (got {kind[0]}): {kind[1]}")
+
+
+def _is_colmap_model(folder: Path) -> bool:
+    """Return True for a folder with the cameras of a COLMAP model."""
+    return any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))

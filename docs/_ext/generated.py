@@ -1,4 +1,4 @@
-"""Fills in what is generated: a page says where by a comment such as ``<!-- generated: scene -->``.
+"""Fills in what is generated: a page says where by a comment such as ``<!-- generated: gallery -->``.
 
 So the pages stay readable where nothing is built, and what they say of the code cannot be out of date.
 """
@@ -11,14 +11,11 @@ import importlib.util
 import inspect
 import pkgutil
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 from docutils import nodes
 from pictures import GALLERY, SCENES, SHEETS
-from scene_reference import scene_reference
 from sphinx.application import Sphinx
 from sphinx.domains.python import PyObject
 
@@ -50,23 +47,6 @@ PACKAGES = (
         "checks",
     ),
 )
-
-
-def _scene() -> str:
-    from mitsplat.scene import scene_json_schema
-
-    return scene_reference(scene_json_schema())
-
-
-def _cli() -> str:
-    """Typer's own reference without its first heading; the list of commands, which it cuts short, whole and linked."""
-    command = [sys.executable, "-m", "typer", "mitsplat.cli", "utils", "docs", "--name", "mitsplat"]
-    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    told = dict(re.findall(r"^## `mitsplat (\w+)`\n\n(.+)", text, re.MULTILINE))
-    text = re.sub(
-        r"^\* `(\w+)`: .*", lambda m: f"* [`{m[1]}`](#mitsplat-{m[1]}): {told[m[1]]}", text, flags=re.MULTILINE
-    )
-    return text.split("\n", 1)[1]
 
 
 def _gallery() -> str:
@@ -138,8 +118,6 @@ def _plugins() -> str:
 
 
 GENERATED: dict[str, Callable[[], str]] = {
-    "scene": _scene,
-    "cli": _cli,
     "gallery": _gallery,
     "scripts": _scripts,
     "api": _api,

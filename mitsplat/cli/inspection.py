@@ -201,9 +201,10 @@ def chart(
 ) -> None:
     """Measure speed and accuracy of the rendering presets on SCENE.
 
-    The reference for all presets and for several cheaper light models is the preset exact. If all objects have
-    materials, the reference for objects is their path-traced meshes. The chart then also contains captured objects
-    and meshes with fewer paths. Times are valid for this machine only. Memory is main memory, not GPU memory.
+    The error of a preset, and of several cheaper light models, is the difference from the preset exact. If all objects
+    have materials, the error of objects is the difference from their path-traced meshes. The chart then also has
+    objects with captured colours, and path tracing with fewer paths. Times are valid for this machine only. Memory is
+    main memory, not GPU memory.
     """
     from rich.console import Console
     from rich.table import Table

@@ -44,19 +44,17 @@ AssetFolder = Annotated[Path, typer.Option("--out", "-o", help="Asset folder to 
 ShDegree = Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 3.")]
 Metallic = Annotated[
     float | None,
-    typer.Option(help="Metalness, 0 to 1 (metal): the object gets one material, and its colours become base colours."),
+    typer.Option(help="Metalness of the whole object, 0 to 1 (metal); the captured colours become base colours."),
 ]
 Roughness = Annotated[
     float | None,
-    typer.Option(help="Roughness, 0 (mirror) to 1: the object gets one material, and its colours become base colours."),
+    typer.Option(help="Roughness of the whole object, 0 (mirror) to 1; the captured colours become base colours."),
 ]
 Faces = Annotated[int, typer.Option(help="Maximum number of mesh faces.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 JsonLog = Annotated[
     bool,
-    typer.Option(
-        "--json", help="Write a log for machines to stderr instead of a progress bar: one JSON object per line."
-    ),
+    typer.Option("--json", help="Write the progress to stderr as one JSON object per line, instead of a progress bar."),
 ]
 
 

@@ -51,8 +51,8 @@ ScaleFrom = Annotated[
     tuple[str, str, float] | None,
     typer.Option(
         metavar="A B METRES",
-        help="Known distance between two points: PHOTO is the camera centre of a photo, PHOTO:X,Y the "
-        "surface point at a pixel.",
+        help="Known distance between two points. Each of A and B is PHOTO (the centre of its camera) or PHOTO:X,Y (the "
+        "surface at this pixel).",
     ),
 ]
 Picks = Annotated[
@@ -86,8 +86,8 @@ Size = Annotated[
 Lights = Annotated[
     Path | None,
     typer.Option(
-        help="Lights of the photos in the frame of the capture, a file by `mitsplat lights`: the materials of the "
-        "object are estimated."
+        help="Lights of the photos in the frame of the capture, a file that `mitsplat lights` wrote; the materials of "
+        "the object are then estimated."
     ),
 ]
 Budget = Annotated[
@@ -371,10 +371,11 @@ def asset(
     """Make an asset from PHOTOS.
 
     The command runs the stages `capture`, `fit` and `mesh`, whose commands have further options. An interrupted run
-    continues when the command runs again.
-    The page report.html shows the result. For an environment, level surfaces are detected. A scene file beside the
-    asset folder then drops objects on the surface at which the photos are directed. The exit status is 4 if a quality
+    continues when the command runs again. The page report.html shows the result. The exit status is 4 if a quality
     threshold is missed.
+
+    In an environment, level surfaces are detected. The command also writes a scene file beside the asset folder, which
+    drops objects on the surface at which the photos are directed.
     """
     from mitsplat.reconstruct.materials.capture_light import CaptureLight
     from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos, default_fit

@@ -109,7 +109,7 @@ class Intrinsics(StrictModel):
 
 
 class Motion(StrictModel):
-    """Exposure, in which a conveyor's belt and the objects on it move."""
+    """Exposure time, during which the belt of the conveyor and the objects on it move."""
 
     exposure: PositiveRange = Field(description="Range of exposure times [s], drawn for every view.")
 
@@ -119,7 +119,7 @@ class CameraKeys(StrictModel):
 
     intrinsics: Intrinsics = Field(Intrinsics(fov_x=60), description="Lens and sensor geometry.")
     motion: Motion | None = optional_field(
-        "Exposure, which blurs what the conveyor moves. Labels refer to its middle. Needs a conveyor."
+        "Motion blur of all that the conveyor moves. Labels refer to the middle of the exposure. Needs a conveyor."
     )
 
 
@@ -149,7 +149,7 @@ class CameraPath(CameraKeys):
 
     kind: Literal["path"] = Field("path", description="Path through key poses.")
     keys: tuple[PoseKey, ...] = Field(min_length=1, description="Key poses, evenly spaced in time.")
-    jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma [m].")
+    jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma along each axis [m].")
 
 
 Row = tuple[float, float, float, float]
@@ -247,7 +247,7 @@ class CameraOrbit(CameraKeys):
     height: float = Field(description="Height of the circle above the target [m].")
     start: float = Field(0.0, description="First azimuth, 0 along +x, counter-clockwise seen from above [degrees].")
     sweep: float = Field(360.0, ge=-360, le=360, description="Azimuth range of the views of a layout [degrees].")
-    jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma [m].")
+    jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the eye, 1 sigma along each axis [m].")
 
 
 TRIES = 16
@@ -266,13 +266,13 @@ class Acceptance(StrictModel):
 
 
 class Occlusion(StrictModel):
-    """Target share of objects of which 10 to 80 % are hidden, among the labelled objects in view."""
+    """Partly hidden objects, of which other objects or shapes hide 10 to 80 %."""
 
     share: Unit = Field(description="Target share of partly hidden objects among the labelled objects in view.")
 
 
 class Truncation(StrictModel):
-    """Target share of objects of which the border of the image cuts off 5 to 80 %, among those in view."""
+    """Truncated objects, of which the border of the image cuts off 5 to 80 %."""
 
     share: Unit = Field(description="Target share of truncated objects among the labelled objects in view.")
 
@@ -288,7 +288,9 @@ class CameraHemisphere(CameraKeys):
         (0.0, 360.0), description="Range of azimuths, 0 along +x, counter-clockwise seen from above [degrees]."
     )
     roll: Range = Field((0.0, 0.0), description="Range of rotations about the optical axis [degrees].")
-    target_jitter: NonNegativeFloat = Field(0.0, description="Random displacement of the target, 1 sigma [m].")
+    target_jitter: NonNegativeFloat = Field(
+        0.0, description="Random displacement of the target, 1 sigma along each axis [m]."
+    )
     look_at: Literal["target", "objects"] = Field(
         "target",
         exclude_if=lambda look_at: look_at == "target",

@@ -54,8 +54,8 @@ class Randomise(StrictModel):
     white_balance: KelvinRange = Field(
         (DAYLIGHT, DAYLIGHT),
         description="Colour temperature that appears white [K]. With ``composite.white_balance: auto`` it is the error "
-        "of the automatic white balance: light that would be neutral has the colour that light of 6504 K has under "
-        "this white balance.",
+        "of the automatic white balance: neutral light looks as light of 6504 K does to a camera that is balanced for "
+        "this temperature.",
     )
     iso: PositiveRange | None = Field(
         None,
@@ -171,7 +171,7 @@ class CameraExposure(StrictModel):
 
 
 class Composite(StrictModel):
-    """Composition of the layers into an image."""
+    """Composition of an image: traced light, exposure and tone curve."""
 
     shadow: Literal["traced", "image", "none"] = Field(
         "traced",
@@ -182,14 +182,14 @@ class Composite(StrictModel):
         0.03,
         gt=0,
         lt=1,
-        description="Target standard error of traced light that is half as bright as white. Elsewhere the target is "
-        "perceptually equal. It determines the numbers of rays of shadows and reflections: 0.03 takes 10 to 64 rays "
-        "per pixel in penumbras and on objects.",
+        description="Target standard error of traced light that is half as bright as white. The target for other light "
+        "is equal in perceived brightness. Smaller values take more rays for shadows and reflections: 0.03 takes 10 "
+        "to 64 rays per pixel in penumbras and on objects.",
     )
     highlight: bool = Field(
         True,
-        description="Adds reflections that do not have the colour of the surface: all of "
-        "plastics, and those at grazing angles of metals.",
+        description="Adds reflections that do not have the colour of the surface: those of plastics, and those of "
+        "metals at grazing angles.",
     )
     occluders: Literal["proxies", "splats"] = Field(
         "proxies",
@@ -198,7 +198,7 @@ class Composite(StrictModel):
     )
     bounce: bool = Field(
         True,
-        description="Adds the light that surroundings and objects reflect onto objects, and objects onto surfaces.",
+        description="Adds indirect light: from surroundings and objects onto objects, and from objects onto surfaces.",
     )
     exposure: Annotated[
         Literal["auto", "fixed"] | CameraExposure,
@@ -206,9 +206,9 @@ class Composite(StrictModel):
     ] = Field(
         "auto",
         description="``auto`` meters the picture: its mean encoded luminance is middle grey, 118 of 255. "
-        "``fixed`` shows a white surface of radiance 1 W/(m^2 sr) as white, or that of the stated "
-        "``white`` of a captured environment. A mapping is the exposure of a camera. ``randomise.exposure`` is "
-        "added in all cases.",
+        "``fixed`` shows a radiance of 1 W/(m^2 sr) as white or, if the asset of the environment states ``white``, "
+        "that of a white surface under this irradiance. A mapping is the exposure of a camera. "
+        "``randomise.exposure`` is added in all cases.",
     )
     white_balance: Annotated[
         Kelvin | Literal["auto"],
@@ -225,7 +225,7 @@ class Composite(StrictModel):
 
 
 class Rendering(StrictModel):
-    """Options of the splat renderer that do not depend on the preset, see :class:`mitsplat.quality.Quality`."""
+    """Splat rendering, independent of the preset."""
 
     response: ResponseName = Field(
         "perspective",
@@ -240,8 +240,8 @@ class Rendering(StrictModel):
     )
     samples: Annotated[int, Field(ge=1, le=8)] | Literal["edges"] = Field(
         "edges",
-        description="Rays per pixel along each axis. ``edges`` takes one ray per pixel. Where objects border on each "
-        "other, ``edges`` and 2 take 2 x 2 rays, and larger numbers 4 x 4.",
+        description="Rays per pixel along each axis; ``edges`` takes one. At borders of objects, ``edges`` and 2 take "
+        "2 x 2 rays, and larger numbers 4 x 4.",
     )
     lens_rings: int = Field(
         2,

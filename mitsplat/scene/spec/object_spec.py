@@ -212,9 +212,8 @@ class Settle(StrictModel):
 
     arrangement: Arrangements = Field(
         ("drop",),
-        description="Arrangement of the objects: random drop, tossed, tipped out of a container, pushed together, "
-        "shaken, pile, sparse scatter, stacks, upright, a tower, or packed side by side. Each layout has one "
-        "arrangement of a list; they are dealt in rounds, so that a name that occurs twice is twice as frequent.",
+        description="Initial arrangement of the objects: one name, or a list. Each layout has one arrangement of the "
+        "list, all equally often; a name that occurs twice is used twice as often.",
     )
     speed: SpeedRange = Field(
         USUAL_SPEED,

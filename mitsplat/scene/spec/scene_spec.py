@@ -71,23 +71,23 @@ class Output(StrictModel):
     rectify: bool = Field(
         False,
         exclude_if=lambda rectify: not rectify,
-        description="Images of the pinhole camera with the same intrinsic matrix, without the lens distortion, as "
-        "``cv2.undistort(image, K, distortion)`` makes them of photographs. All labels belong to these images. BOP "
-        "needs it for a camera with distortion.",
+        description="Writes images without lens distortion, of a pinhole camera with the same intrinsic matrix, as "
+        "``cv2.undistort(image, K, distortion)`` makes them of photographs. All labels belong to these images. The "
+        "format ``bop`` needs it for a camera with distortion.",
     )
     image: Literal["png", "jpg"] = Field("png", description="Image file format.")
     validation: Unit = Field(
         0.2,
-        description="Share of layouts in the validation split. Of the two splits, the smaller one starts with the "
-        "second layout.",
+        description="Share of layouts in the validation split. The second layout is the first one of the "
+        "smaller of the two splits.",
     )
     test: float = Field(
         0.0,
         ge=0,
         lt=1,
         exclude_if=lambda test: test == 0,
-        description="Share of layouts in the test split. The second layout is the first of this split, if the share "
-        "is at most one half. The other layouts are divided into training and validation.",
+        description="Share of layouts in the test split. If it is at most one half, the second layout is the first one "
+        "of this split. The other layouts are divided into training and validation.",
     )
 
     @model_validator(mode="after")
@@ -110,7 +110,7 @@ class HoldOut(StrictModel):
 
 
 class LabelRules(StrictModel):
-    """Rules for labels, see :mod:`mitsplat.labels.labels`."""
+    """Source of the masks, and conditions that a labelled instance fulfils."""
 
     source: Literal["splats", "proxies"] = Field(
         "splats",
@@ -154,8 +154,8 @@ class SceneSpec(StrictModel):
         "Room around the scene. It is useful if the environment is only a table, or if the scene has only shapes."
     )
     conveyor: Conveyor | None = optional_field(
-        "Belt, one of the shapes, that moves objects between the views of a layout. At the middle of the "
-        "run, the objects are where they settled."
+        "Belt that moves objects between the views of a layout. Half of the views show the objects before they "
+        "reach the place where they settled, and half after it."
     )
     background: Background | None = optional_field("Images behind the scene, in place of grey.")
     objects: tuple[ObjectSpec, ...] = Field((), description="Objects that are dropped and labelled.")
@@ -172,7 +172,7 @@ class SceneSpec(StrictModel):
     )
     enclosure: Enclosure | None = Field(None, description="Invisible walls around the region.")
     settle: Settle = Field(Settle(), description="Initial arrangement and physics simulation of the objects.")
-    camera: CameraSpec = Field(description="The camera: lens and viewpoints.")
+    camera: CameraSpec = Field(description="Lens and viewpoints of the camera.")
     lights: tuple[LightEntry, ...] = Field((), description="Light sources.")
     randomise: Randomise = Field(Randomise(), description="Ranges of the values that vary between images or layouts.")
     composite: Composite = Field(Composite(), description="Shadows, highlights, exposure and tone curve.")

@@ -29,14 +29,16 @@ class Bin(StrictModel):
 
 
 class Shape(StrictModel):
-    """Box, bin or mesh that is rendered, collides or shadows."""
+    """Static box, bin or mesh that is visible, collides with objects, or only affects the light."""
 
     name: str = Field(min_length=1, description="Name, unique among the shapes.")
     box: Box | None = Field(
         None, description="Geometry: a box. A shape has exactly one of ``box``, ``bin`` and ``mesh``."
     )
     bin: Bin | None = Field(None, description="Geometry: an open bin.")
-    mesh: str | None = Field(None, description="Geometry: a mesh file in world space, relative to the scene file.")
+    mesh: str | None = Field(
+        None, description="Geometry: path of a mesh file, whose vertices are in world coordinates."
+    )
     units: Positive | None = Field(
         None,
         exclude_if=lambda units: units is None,
@@ -53,8 +55,8 @@ class Shape(StrictModel):
     collider: bool = Field(True, description="The shape collides with objects.")
     proxy: bool = Field(
         False,
-        description="Rays of light are traced against the shape although it is not rendered. Use it for a table that "
-        "only the splats show.",
+        description="An invisible shape casts shadows and reflects light. Use it for a table that only the splats "
+        "of the environment show.",
     )
     colour: tuple[Unit, Unit, Unit] = Field((0.6, 0.6, 0.6), description="Diffuse reflectance, sRGB-encoded.")
     materials: tuple[Material, ...] = Field(
@@ -92,14 +94,14 @@ class Shape(StrictModel):
     rolling_friction: NonNegativeFloat | None = Field(
         None,
         exclude_if=lambda length: length is None,
-        description="Length of rolling friction [m]. A contact has the larger one of both sides. If absent, objects "
-        "determine it.",
+        description="Lever arm of rolling friction [m]. A contact has the larger value of its two sides, or that of "
+        "the object if the shape has none.",
     )
     torsional_friction: NonNegativeFloat | None = Field(
         None,
         exclude_if=lambda radius: radius is None,
-        description="Contact radius of spin friction [m]. A contact has the larger one of both sides. If absent, "
-        "objects determine it.",
+        description="Contact radius of spin friction [m]. A contact has the larger value of its two sides, or that of "
+        "the object if the shape has none.",
     )
 
     @model_validator(mode="after")

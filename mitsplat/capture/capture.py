@@ -164,7 +164,7 @@ class Photo:
 
     def fitted(self, size: float) -> SizedPhoto:
         """Read the photo with a longest edge of at most ``size`` px."""
-        scale = min(1.0, size / max(self.camera.width, self.camera.height))
+        scale = min(1.0, size / max(self.camera.size))
         return SizedPhoto(self.camera.fitted(size), *self.read(scale))
 
     @cached_property
@@ -182,7 +182,7 @@ class Photo:
         """Read an image, converted to the first of ``modes`` unless its mode is among them."""
         with _open_image(path) as image:
             pixels = image.convert(image.mode if image.mode in modes else modes[0])
-        size = (self.camera.width, self.camera.height)
+        size = self.camera.size
         if pixels.size != size:
             raise InputError(
                 f"{path}: must have the size of its camera, {size[0]}x{size[1]} px (got {pixels.width}x{pixels.height})"
@@ -215,6 +215,19 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
         raise InputError(f"{path}: no such file") from None
     except IMAGE_ERRORS as error:
         raise InputError(f"{path}: not a readable image ({error})") from error
+
+
+def parse_pixel(text: str, place: str) -> tuple[float, float]:
+    """Return the coordinates of a text X,Y.
+
+    Raises:
+        InputError: If it is no such text. The message begins with ``place``.
+    """
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        raise InputError(f"{place}: a pixel must be given as X,Y (got {text})") from None
+    return x, y
 
 
 @checks_arguments
@@ -305,11 +318,7 @@ class Capture:
             raise InputError(
                 f"{pick}: a pick must be PHOTO:X,Y of a photo with a camera, such as {min(photos)}:400,300"
             )
-        try:
-            x, y = map(float, pixel.split(","))
-        except ValueError:
-            raise InputError(f"{pick}: a pixel must be given as X,Y (got {pixel})") from None
-        return photos[name], (x, y)
+        return photos[name], parse_pixel(pixel, pick)
 
     def transformed(self, matrix: npt.ArrayLike) -> Capture:
         """Return the capture after a similarity transform.

@@ -9,16 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from mitsplat.arrays import BoolArray, ByteImage, Float64Array
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.photo_masks import NO_OCCLUSION, Hidden, MaskMaker, add_masks
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
-from mitsplat.images.masks import largest_part
+from mitsplat.geometry.clusters import cluster_points, gap_between
+from mitsplat.geometry.triangulation import count_observers
+from mitsplat.images.masks import disc, fill_hull, largest_part
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores
 
@@ -94,10 +93,7 @@ def object_masks(
 def geometric_masks(points: Float64Array, bare: Bare | None = None, hidden: Hidden = NO_OCCLUSION) -> MaskMaker:
     """Return a function that computes masks by GrabCut (Rother et al. 2004), initialised by the hull of object points.
 
-    Args:
-        points: Points of the object in the frame of the capture, shape (N, 3); see :func:`object_points`.
-        bare: Function that finds pixels that are certainly not the object.
-        hidden: Pixels in which other objects may occlude the object.
+    The arguments are those of :func:`object_masks`.
     """
 
     def make(photo: Photo) -> BoolArray:
@@ -105,7 +101,7 @@ def geometric_masks(points: Float64Array, bare: Bare | None = None, hidden: Hidd
         unknown = _resize_occlusion(hidden.get(photo.name), camera)
         pixels, _ = camera.project(points)
         # A point close to the camera plane projects to coordinates that overflow an integer.
-        near = (np.abs(pixels) < _PROJECTION_LIMIT * max(camera.width, camera.height)).all(axis=1)
+        near = (np.abs(pixels) < _PROJECTION_LIMIT * max(camera.size)).all(axis=1)
         return _resize_mask(
             _segment_from_points(bgr, pixels[near], _background_pixels(bare, camera, bgr), unknown), photo.camera
         )
@@ -121,11 +117,8 @@ def agreed_masks(
     In one photo, background such as a dark corner can look like the object. Other photos show it beside the object. The
     visual hull (Laurentini 1994) of all masks, except the few that contradict the rest, gives the common outline.
 
-    Args:
-        masked: Capture with initial masks.
-        points: Points of the object in the frame of the capture, shape (N, 3); they bound the hull.
-        bare: Function that finds pixels that are certainly not the object.
-        hidden: Pixels in which other objects may occlude the object.
+    The arguments after ``masked``, the capture with initial masks, are those of :func:`object_masks`. The points bound
+    the hull.
     """
     small = {photo.name: _reduce_photo(photo) for photo in masked.photos}
     shown = [(camera, mask | _resize_occlusion(hidden.get(name), camera)) for name, (camera, _, mask) in small.items()]
@@ -159,21 +152,14 @@ def object_points(capture: Capture) -> Float64Array:
     """
     centres = np.array([photo.camera.centre for photo in capture.photos])
     distance = float(np.median(np.linalg.norm(centres, axis=1)))
-    counts = np.zeros(len(capture.points), dtype=np.int64)
-    for photo in capture.photos:
-        counts[photo.seen] += 1
-    points = capture.points[counts >= 3]
+    points = capture.points[count_observers([photo.seen for photo in capture.photos], len(capture.points)) >= 3]
     points = points[(points[:, 2] > _MIN_HEIGHT * distance) & (np.linalg.norm(points, axis=1) < 0.9 * distance)]
     if len(points) < 20:
         raise InputError(
             f"no object was found above the table in the photos ({len(points)} points above it): give masks, or take "
             "photos of one object on a textured table"
         )
-    tree = cKDTree(points)
-    reach = float(np.clip(4 * np.median(tree.query(points, k=6)[0][:, -1]), 0.05 * distance, 0.1 * distance))
-    pairs = tree.query_pairs(reach, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
-    label = connected_components(graph, directed=False)[1]
+    label = cluster_points(points, gap_between(points, 0.05 * distance, 0.1 * distance))
     sizes = np.bincount(label)
     offset = np.array([np.linalg.norm(points[label == k, :2].mean(axis=0)) for k in range(len(sizes))])
     chosen = int(np.argmax(sizes / (0.1 + offset / distance)))
@@ -193,9 +179,7 @@ def _resize_occlusion(hidden: BoolArray | None, camera: Camera) -> BoolArray:
     """Return the possibly occluded pixels in the size of a camera's picture; no pixels if None."""
     if hidden is None:
         return np.zeros((camera.height, camera.width), dtype=bool)
-    return np.asarray(
-        cv2.resize(hidden.astype(np.uint8), (camera.width, camera.height), interpolation=cv2.INTER_NEAREST) > 0
-    )
+    return np.asarray(cv2.resize(hidden.astype(np.uint8), camera.size, interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def _segment_from_points(image: ByteImage, pixels: Float64Array, free: BoolArray, unknown: BoolArray) -> BoolArray:
@@ -209,7 +193,7 @@ def _segment_from_points(image: ByteImage, pixels: Float64Array, free: BoolArray
     if len(pixels) < 3:
         return nothing
     filled = np.zeros((height, width), dtype=np.uint8)
-    cv2.fillConvexPoly(filled, np.rint(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32), 1)
+    fill_hull(filled, pixels)
     if not filled.any():
         return nothing
     dots = np.zeros_like(filled)
@@ -291,7 +275,7 @@ def _silhouette(cells: Float64Array, cell: float, camera: Camera) -> BoolArray:
     """Return the pixels covered by cells of edge ``cell``, shape (H, W)."""
     shown = np.zeros((camera.height, camera.width), dtype=np.uint8)
     pixels, depths = camera.project(cells)
-    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    inside = camera.contains(pixels)
     if not inside.any():
         return shown > 0
     x, y = pixels[inside].astype(np.intp).T
@@ -322,10 +306,9 @@ def _reduce_photo(photo: Photo, share: float = 1.0) -> tuple[Camera, ByteImage, 
 def _resize_mask(mask: BoolArray, camera: Camera) -> BoolArray:
     """Return a mask resampled to the size of the camera."""
     soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.0)
-    return np.asarray(cv2.resize(soft, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC) >= 0.5)
+    return np.asarray(cv2.resize(soft, camera.size, interpolation=cv2.INTER_CUBIC) >= 0.5)
 
 
 def _dilate(mask: npt.NDArray[np.generic], radius: float) -> BoolArray:
     """Dilate a mask by a disc with a radius of at least one pixel."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(1, round(radius)) + 1,) * 2)
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc(max(1, round(radius)))) > 0)

@@ -174,7 +174,7 @@ def _upright_photos(
             continue
         stored = photo.size
         shown = stored[::-1] if photo.pending >= _FIRST_TURNED else stored
-        fits = [name in sized and not shapes_differ(_size(model.cameras[name]), size) for size in (stored, shown)]
+        fits = [name in sized and not shapes_differ(model.cameras[name].size, size) for size in (stored, shown)]
         decision = fits[1] if any(fits) and not all(fits) else None
         if decision is None and name in sized:
             decision = _coloured_upright(model, name, photo)
@@ -245,13 +245,9 @@ def _check_coordinates(source: Path, model: SparseModel) -> None:
             raise InputError(f"{source}: {name} must lie within {_MAX_COORDINATE:g} of the origin (got {farthest:g})")
 
 
-def _size(camera: Camera) -> tuple[int, int]:
-    return camera.width, camera.height
-
-
 def _resized_camera(source: Path, name: str, camera: Camera, size: tuple[int, int]) -> Camera:
     """Return the camera resized to the pixels of a reduced copy."""
-    if shapes_differ(_size(camera), size):
+    if shapes_differ(camera.size, size):
         raise InputError(
             f"{source}: {name} must have the aspect ratio of its photo, {size[0]}x{size[1]} px (got {camera.width}x"
             f"{camera.height})"

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from mitsplat.arrays import Float64Array
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
@@ -197,7 +198,7 @@ def _lens_of(content: Transforms, frame: _Frame) -> _Lens:
     return _Lens.model_validate(common | own)
 
 
-def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Camera:
+def _camera(lens: _Lens, width: int, height: int, pose: Float64Array) -> Camera:
     """Return the OpenCV camera of a frame, with the y and z axes of OpenGL negated."""
     if lens.camera_model not in ("OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         raise ValueError(
@@ -218,7 +219,6 @@ def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ..
     distortion = (lens.k1, lens.k2, lens.p1, lens.p2) + ((lens.k3,) if lens.k3 else ())
     if fisheye:
         distortion = (lens.k1, lens.k2, lens.k3, lens.k4)
-    pose = pose @ OPENCV_FROM_OPENGL
     return Camera(
         width=width,
         height=height,
@@ -226,7 +226,7 @@ def _camera(lens: _Lens, width: int, height: int, pose: np.ndarray[tuple[int, ..
         fy=float(focal_y or focal),
         cx=0.5 * width if lens.cx is None else lens.cx,
         cy=0.5 * height if lens.cy is None else lens.cy,
-        world_from_camera=pose,
+        world_from_camera=pose @ OPENCV_FROM_OPENGL,
         distortion=distortion if fisheye or any(distortion) else (),
         lens="fisheye" if fisheye else "opencv",
     )

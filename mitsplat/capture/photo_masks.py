@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -17,7 +17,7 @@ from mitsplat.capture.capture import Capture, Photo, mask_name
 from mitsplat.capture.photos import Prepared, alpha_channel, mask_files, plain_background, read_mask, with_orientation
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
-from mitsplat.images.masks import largest_part
+from mitsplat.images.masks import border_of, largest_part
 from mitsplat.progress import Progress
 from mitsplat.runtime.onnx_networks import load_library
 from mitsplat.storage.files import write_file
@@ -92,9 +92,8 @@ def check_borders(capture: Capture, source: Path) -> Capture:
     Raises:
         InputError: If most masks are white along the border of the photo, as inverted masks are.
     """
-    masks = [photo.read().mask for photo in capture.photos]
-    borders = [np.concatenate([m[0], m[-1], m[:, 0], m[:, -1]]) for m in masks if m is not None]
-    around = sum(bool(border.mean() > _MAX_BORDER) for border in borders)
+    masks = [photo.read_mask()[0] for photo in capture.photos]
+    around = sum(bool(border_of(mask).mean() > _MAX_BORDER) for mask in masks if mask is not None)
     if around > len(capture.photos) / 2:
         raise InputError(
             f"{source}: masks must be white, or photos opaque, only on the object (got {around} of "
@@ -127,21 +126,18 @@ def given_masks(folder: Path, prepared: Mapping[str, Prepared], lenses: Mapping[
     return make
 
 
-def cutout_masks(
-    folder: Path, prepared: Mapping[str, Prepared], lenses: Mapping[str, Camera], names: Collection[str]
-) -> MaskMaker | None:
+def cutout_masks(folder: Path, prepared: Mapping[str, Prepared], lenses: Mapping[str, Camera]) -> MaskMaker | None:
     """Return a function that takes the masks of photos whose background was removed from their transparency.
 
     Args:
         folder: Folder of the photos.
         prepared: Photo copies by the name of the photo.
         lenses: Cameras of the copies, before distortion was removed.
-        names: Names of the photos.
 
     Returns:
         None if a photo has no alpha channel, or if no photo has a transparent pixel.
     """
-    opaque = [prepared[name].opaque for name in names]
+    opaque = [prepared[name].opaque for name in lenses]
     if None in opaque or min(share for share in opaque if share is not None) == 1:
         return None
 

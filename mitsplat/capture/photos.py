@@ -20,6 +20,7 @@ from mitsplat.capture.name_matching import composed
 from mitsplat.capture.video.sharpness import sharpness
 from mitsplat.errors import InputError
 from mitsplat.images.colour import eight_bit, in_srgb
+from mitsplat.images.masks import border_of
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.storage.file_kinds import check_path_encoding
@@ -200,21 +201,12 @@ def _prepare(
     rgb = eight_bit(turned)
     if max(rgb.size) > max_size:
         rgb.thumbnail((max_size, max_size), Image.Resampling.LANCZOS)
-    if not file.exists():
-        if kept:
-            write_file(file, partial(shutil.copyfile, path))
-        else:
-            # EXIF is copied for the focal length, the initial value of COLMAP; the orientation is removed, because some
-            # readers apply it.
-            exif = turned.getexif()
-            exif.pop(ExifTags.Base.Orientation, None)
-            try:
-                kept_exif = exif.tobytes()
-            except (ValueError, TypeError, AttributeError, struct.error):  # value types that no file can store
-                kept_exif = b""
-            options: dict[str, int | bytes] = {"quality": 95, "subsampling": 0} if lossy else {}
-            options["exif"] = kept_exif if len(kept_exif) < 65_000 else b""  # limit of a JPEG segment
-            write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", **options))
+    if kept and not file.exists():
+        write_file(file, partial(shutil.copyfile, path))
+    elif not file.exists():
+        options: dict[str, int | bytes] = {"quality": 95, "subsampling": 0} if lossy else {}
+        options["exif"] = _upright_exif(turned)
+        write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", **options))
     focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)
     lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
     grey = np.asarray(rgb.convert("L"))
@@ -236,6 +228,20 @@ def _prepare(
     return _MeasuredPhoto(prepared, sharp, is_cutout, min(clipped, key=max), int(grey[shown].max()))
 
 
+def _upright_exif(image: Image.Image) -> bytes:
+    """Return the EXIF data of an image without its orientation, which some readers apply.
+
+    COLMAP takes the initial focal length from these data.
+    """
+    exif = image.getexif()
+    exif.pop(ExifTags.Base.Orientation, None)
+    try:
+        data = exif.tobytes()
+    except (ValueError, TypeError, AttributeError, struct.error):  # value types that no file can store
+        return b""
+    return data if len(data) < 65_000 else b""  # limit of a JPEG segment
+
+
 def alpha_channel(image: Image.Image) -> Image.Image | None:
     """Return the alpha channel of an image; None if it has none."""
     if "transparency" in image.info:  # a colour, or the alpha of the colours of a palette
@@ -251,14 +257,14 @@ def plain_background(rgb: ByteImage, *, without_noise: bool = False) -> BoolArra
     Returns:
         Shape (H, W); None unless at least half of the border has one colour, black or white.
     """
-    border = np.concatenate([rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]]).astype(np.int16)
+    border = border_of(rgb).astype(np.int16)
     for colour in (0, 255):
         plain, near = (np.mean((np.abs(border - colour) <= limit).all(axis=1)) for limit in (_PLAIN, _NEARLY_PLAIN))
         if plain < _PLAIN_BORDER or (without_noise and near - plain > _MAX_NOISE):
             continue
         alike = np.asarray((np.abs(rgb.astype(np.int16) - colour) <= _PLAIN).all(axis=2), dtype=np.uint8)
         parts = cv2.connectedComponents(alike, connectivity=4)[1]
-        outer = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+        outer = np.unique(border_of(parts))
         return np.asarray(np.isin(parts, outer[outer > 0]))
     return None
 

@@ -24,6 +24,8 @@ from mitsplat.arrays import AnyArray, Float64Array, Int32Array
 from mitsplat.capture.photos import Prepared
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import homogeneous_matrix
+from mitsplat.geometry.triangulation import count_observers
 from mitsplat.progress import Progress
 from mitsplat.runtime.child_process import python_command, python_environment
 from mitsplat.storage.files import JsonObject, write_text
@@ -101,10 +103,7 @@ class SparseModel:
     def without(self, names: Collection[str]) -> SparseModel:
         """Return the model without the named images, and without points that fewer than two other images observe."""
         kept = [name for name in self.cameras if name not in names]
-        observers = np.zeros(len(self.points), dtype=np.int64)
-        for name in kept:
-            observers[self.seen[name]] += 1
-        stays = observers >= 2
+        stays = count_observers([self.seen[name] for name in kept], len(self.points)) >= 2
         place = np.cumsum(stays) - 1
         return SparseModel(
             {name: self.cameras[name] for name in kept},
@@ -128,7 +127,7 @@ def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | 
 
 
 def find_points(
-    photos: Sequence[Prepared], cameras: Mapping[str, Camera], folder: Path, progress: Progress | None = None
+    photos: Sequence[Prepared], cameras: Mapping[str, Camera], folder: Path, progress: Progress | None
 ) -> SparseModel:
     """Triangulate the common points of photographs with fixed, known cameras.
 
@@ -197,9 +196,8 @@ def opencv_camera(
     fx, fy, cx, cy, *distortion = (float(values[place]) for place in _MODELS[model])
     # Quaternions of text files have few digits, so use the nearest rotation.
     u, _, vt = np.linalg.svd(camera_from_world[:3, :3])
-    pose = np.eye(4)
-    pose[:3, :3] = (u @ vt).T
-    pose[:3, 3] = -pose[:3, :3] @ camera_from_world[:3, 3]
+    rotation = (u @ vt).T
+    pose = homogeneous_matrix(rotation, -rotation @ camera_from_world[:3, 3])
     fisheye = model.endswith("_FISHEYE")
     try:
         return Camera(

@@ -343,7 +343,7 @@ def _check_view(scene: Scene) -> Finding:
     for index in views:
         camera = plan_frame(scene, index).camera
         pixels, depths = camera.project(middles)
-        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        inside = camera.contains(pixels)
         if not (inside & (depths > camera.near)).any():
             blind.append(index)
     where = "a region" if len(middles) > 1 else "the region"

@@ -12,7 +12,7 @@ from mitsplat.formats.coco import image_file
 from mitsplat.images.picture_files import read_picture_inside
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import draw_labels
-from mitsplat.storage.files import Record, write_file
+from mitsplat.storage.files import Record, write_bytes
 
 _TILES, _COLUMNS = 16, 4
 _TILE_WIDTH = 480
@@ -49,7 +49,7 @@ class ContactSheet:
             top, left = i // columns * height, i % columns * width
             sheet[top : top + tile.shape[0], left : left + _TILE_WIDTH] = tile
         _, data = cv2.imencode(".jpg", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 90])
-        write_file(path, lambda temporary: temporary.write_bytes(bytes(data)))
+        write_bytes(path, bytes(data))
 
 
 def _tile(root: Path, record: Record) -> ByteImage:

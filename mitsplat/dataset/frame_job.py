@@ -29,6 +29,7 @@ from mitsplat.storage.files import (
     open_regular,
     parse_json,
     storage_errors,
+    write_bytes,
     write_file,
     write_text,
 )
@@ -168,7 +169,7 @@ class RemoteFrame:
             if digest in written:
                 found = write_file(out / file, partial(link_file, written[digest]))
             else:
-                found = write_file(out / file, partial(_write_bytes, self.contents[digest]))
+                found = write_bytes(out / file, self.contents[digest])
             if found != digest:
                 raise PartialResultError(f"{out / file}: must have the SHA-256 {digest} (got {found}); run again")
             written.setdefault(digest, out / file)
@@ -220,7 +221,3 @@ class RemoteFrameJob:
             images[name].write_bytes(content)
         self.job.scene = replace(self.job.scene, images=images)
         self._unpacked = True
-
-
-def _write_bytes(content: bytes, path: Path) -> None:
-    path.write_bytes(content)

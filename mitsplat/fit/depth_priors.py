@@ -170,7 +170,7 @@ def align_map(photo: Photo, points: Float64Array, values: Float32Array, kind: De
         InputError: If the map does not have the aspect ratio of the photo, or a depth is negative. The message has only
             the rule; the caller adds the file.
     """
-    size, shape = (photo.camera.width, photo.camera.height), values.shape[::-1]
+    size, shape = photo.camera.size, values.shape[::-1]
     if shapes_differ(shape, size):
         raise InputError(f"must have the shape of its photo, {size[0]}x{size[1]} px (got {shape[0]}x{shape[1]})")
     if kind == "metric":

@@ -420,7 +420,7 @@ def _training_view(
     if window is not None:
         camera = camera.cropped(*window)
         inverse_depth = None if inverse_depth is None else crop_map(inverse_depth, photo.camera, window)
-    scale = min(1.0, settings.max_size / max(camera.width, camera.height))
+    scale = min(1.0, settings.max_size / max(camera.size))
     return TrainingView(photo, scale, masked=settings.masks != "off", inverse_depth=inverse_depth, window=window)
 
 

@@ -29,7 +29,7 @@ def object_windows(photos: Sequence[Photo]) -> list[Window | None]:
 
 
 def _window(photo: Photo, box: Int64Array, room: Int64Array) -> Window | None:
-    whole = np.array([photo.camera.width, photo.camera.height])
+    whole = np.array(photo.camera.size)
     size = np.minimum(room, whole)
     if size.max() >= _MAX_CROP_SHARE * whole.max():
         return None

@@ -29,7 +29,7 @@ from mitsplat.formats.format import AnnotationWriter, Catalogue, FrameFiles
 from mitsplat.formats.maps import encode_mask_png
 from mitsplat.geometry.camera import Camera
 from mitsplat.labels.labels import Labels
-from mitsplat.storage.files import GrowingFile, JsonObject, Record, write_file, write_text
+from mitsplat.storage.files import GrowingFile, JsonObject, Record, write_bytes, write_text
 from mitsplat.storage.json_stream import EntriesFile
 
 MILLIMETRES = 1000.0
@@ -146,7 +146,7 @@ def write_models(root: Path, meshes: Mapping[int, trimesh.Trimesh]) -> None:
             **{f"size_{axis}": float(value) for axis, value in zip("xyz", scaled.extents, strict=True)},
         }
         data = trimesh.exchange.ply.export_ply(scaled, encoding="ascii", vertex_normal=True)
-        write_file(root / f"bop/models/obj_{number:06d}.ply", lambda path, data=data: path.write_bytes(data))  # type: ignore[misc]
+        write_bytes(root / f"bop/models/obj_{number:06d}.ply", data)
     write_text(root / "bop/models/models_info.json", json.dumps(info, indent=1))
 
 

@@ -115,7 +115,7 @@ def _pairs(
     axes = np.sort(splats.scales[::step][visible], axis=1)[:, 1:] * slope[:, None]  # of the widest possible outline
     radii = np.sqrt(2 * np.log(excess[visible]))[:, None] * np.sqrt(axes**2 + KERNELS[quality.kernel].variance)  # [px]
     tiles = np.prod(2 * radii / _TILE + 1, axis=1)
-    size, largest = np.array([camera.width, camera.height]), radii[:, 1:]
+    size, largest = np.array(camera.size), radii[:, 1:]
     beyond = largest + margin * size
     inside = ((pixel[visible] > -beyond) & (pixel[visible] < size + beyond)).all(axis=1)
     return step * float(np.minimum(tiles, np.prod((1 + 2 * margin) * size / _TILE + 1))[inside].sum())

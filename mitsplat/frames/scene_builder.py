@@ -90,7 +90,7 @@ class SceneBuilder:
 
     def background(self, index: int, layout: int, camera: Camera) -> mi.Color3f | float:
         """Return the linear background picture of a frame on the device; a grey if the scene has no background."""
-        drawn, size = draw_surroundings(self._scene.spec, index, layout).background, (camera.width, camera.height)
+        drawn, size = draw_surroundings(self._scene.spec, index, layout).background, camera.size
         if drawn is None:
             return BACKGROUND
         path = self._scene.images[drawn.image]

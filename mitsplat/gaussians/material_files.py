@@ -19,7 +19,7 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.gaussians.ply_files import MAX_PLY_HEADER, columns_of, parse_ply_header, vertex_rows
 from mitsplat.gaussians.splat_materials import SplatMaterials
-from mitsplat.storage.files import read_regular, storage_errors, write_file
+from mitsplat.storage.files import read_regular, storage_errors, write_bytes
 
 _PARAMETERS = ("metallic", "roughness", "specular")
 _NORMAL = ("nx", "ny", "nz")
@@ -81,4 +81,4 @@ def write_materials(materials: SplatMaterials, path: Path) -> None:
     properties = "".join(f"property {'uchar' if name in _PARAMETERS else 'float'} {name}\n" for name in names)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(materials)}\n{properties}end_header\n"
     with storage_errors(path.parent):
-        write_file(path, lambda temporary: temporary.write_bytes(header.encode() + rows.tobytes()))
+        write_bytes(path, header.encode() + rows.tobytes())

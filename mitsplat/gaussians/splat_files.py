@@ -38,7 +38,7 @@ from mitsplat.gaussians.splat_checks import check_precision
 from mitsplat.gaussians.spz_files import decode_spz, encode_spz
 from mitsplat.quality import KernelName
 from mitsplat.storage.file_kinds import kind_of_file, refuse_placeholder
-from mitsplat.storage.files import storage_errors, write_file
+from mitsplat.storage.files import storage_errors, write_bytes
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
@@ -114,7 +114,7 @@ def _decode(data: bytes, suffix: str) -> tuple[SplatArrays, KernelName | None, l
     return arrays, kernel, warnings
 
 
-def write_splats(splats: SplatArrays, path: Path, kernel: KernelName | None = None) -> None:
+def write_splats(splats: SplatArrays, path: Path, kernel: KernelName | None) -> None:
     """Write ``splats`` in the format of the suffix of ``path``. The file is replaced atomically.
 
     Args:
@@ -144,7 +144,7 @@ def write_splats(splats: SplatArrays, path: Path, kernel: KernelName | None = No
         rule = "%s: .splat files cannot state that splats were trained with antialiasing: use .ply or .spz"
         _logger.warning(rule, path)
     with storage_errors(path):
-        write_file(path, lambda partial: partial.write_bytes(data))
+        write_bytes(path, data)
 
 
 def _decode_splat(data: bytes) -> SplatArrays:

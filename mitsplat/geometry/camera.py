@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arguments import check_number, checks_arguments, describe
-from mitsplat.arrays import AnyArray, Float64Array, Int64Array
+from mitsplat.arrays import AnyArray, BoolArray, Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.geometry.lens import (
@@ -113,9 +113,7 @@ class Camera:
             object.__setattr__(self, "distortion", distortion_coefficients(self.distortion, self.lens))
         except ValueError as error:
             raise ValueError(f"distortion {error}") from None
-        if fault := lens_fault(
-            (self.width, self.height), (self.fx, self.fy), (self.cx, self.cy), self.distortion, self.lens
-        ):
+        if fault := lens_fault(self.size, (self.fx, self.fy), (self.cx, self.cy), self.distortion, self.lens):
             raise ValueError(fault)
         try:
             pose = rigid_matrix(self.world_from_camera, "world_from_camera")
@@ -123,6 +121,11 @@ class Camera:
             raise ValueError(f"world_from_camera {error}") from None
         pose.flags.writeable = False
         object.__setattr__(self, "world_from_camera", pose)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image [px]."""
+        return self.width, self.height
 
     @property
     def is_pinhole(self) -> bool:
@@ -266,7 +269,7 @@ class Camera:
         """Return the same camera with a longest edge of at most ``size`` px."""
         if not size > 0:
             raise InputError(f"size must be > 0 (got {size})")
-        scale = min(1.0, size / max(self.width, self.height))
+        scale = min(1.0, size / max(self.size))
         return self.resized(max(1, round(self.width * scale)), max(1, round(self.height * scale)))
 
     def transformed(self, matrix: npt.ArrayLike) -> Camera:
@@ -315,9 +318,13 @@ class Camera:
     def visible_pixels(self, points: npt.ArrayLike) -> tuple[Int64Array, Int64Array, Int64Array]:
         """Return the indices of the world points (N, 3) inside the image, and the columns and rows of their pixels."""
         pixels, _ = self.project(points)
-        inside = np.flatnonzero(((pixels >= 0) & (pixels < (self.width, self.height))).all(axis=1))
+        inside = np.flatnonzero(self.contains(pixels))
         x, y = pixels[inside].astype(np.int64).T
         return inside, x, y
+
+    def contains(self, pixels: Float64Array) -> BoolArray:
+        """Return True for each pixel position (..., 2) inside the image."""
+        return np.asarray(((pixels >= 0) & (pixels < self.size)).all(axis=-1))
 
     def sample(self, image: AnyArray, points: npt.ArrayLike, missing: float) -> Float64Array:
         """Return the pixel values (N,) of an image at world points (N, 3); ``missing`` for points outside the image."""
@@ -328,7 +335,7 @@ class Camera:
         return values
 
     def _check_image(self, image: AnyArray) -> None:
-        if image.shape[:2] != (self.height, self.width):
+        if image.shape[1::-1] != self.size:
             size = "x".join(map(str, image.shape[1::-1]))
             raise InputError(f"image must have the size of the camera, {self.width}x{self.height} px (got {size})")
 
@@ -349,7 +356,7 @@ class Camera:
             for x, y in ((0 * side, side), (0 * side + 1, side), (side, 0 * side), (side, 0 * side + 1))
         )
         low = np.array([left[:, 0].max(), top[:, 1].max()])
-        fx, fy = (self.width, self.height) / (np.array([right[:, 0].min(), bottom[:, 1].min()]) - low)
+        fx, fy = self.size / (np.array([right[:, 0].min(), bottom[:, 1].min()]) - low)
         cx, cy = (-low * (fx, fy)).tolist()
         pinhole = replace(self, fx=float(fx), fy=float(fy), cx=cx, cy=cy, distortion=(), lens="opencv")
         columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)

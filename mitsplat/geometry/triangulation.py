@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import Float64Array, Int32Array, Int64Array
 from mitsplat.geometry.camera import Camera
 
 MAX_ERROR = 3.0
@@ -41,6 +41,14 @@ def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64A
             return np.asarray(point)
         del observations[int(errors.argmax())]
     return None
+
+
+def count_observers(seen: Iterable[Int32Array], count: int) -> Int64Array:
+    """Return the number of cameras that observe each of ``count`` points, by the indices that each camera sees."""
+    counts = np.zeros(count, dtype=np.int64)
+    for indices in seen:
+        counts[indices] += 1
+    return counts
 
 
 def nearest_point_to_lines(origins: Float64Array, directions: Float64Array) -> Float64Array:

@@ -16,7 +16,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.spz_files import encode_spz
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.gltf_splats.splat_reading import COMPRESSION, ENCODED, EXTENSION, GLTF_FROM_SPZ
-from mitsplat.storage.files import JsonObject, storage_errors, write_file
+from mitsplat.storage.files import JsonObject, storage_errors, write_bytes
 from mitsplat.version import __version__
 
 _FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0
@@ -100,7 +100,7 @@ def write_gltf_splats(splats: Splats, path: Path, *, name: str, spz: bool = Fals
     if len(content) >= 1 << 32:
         raise InputError(f"{path}: a .glb file must have less than 4 GiB (got {len(content)} bytes)")
     with storage_errors(path):
-        write_file(path, lambda part: part.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(content)) + content))
+        write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + len(content)) + content)
 
 
 def _spz_unit(splats: Splats) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pycocotools import mask as coco_mask
 
-from mitsplat.arrays import BoolArray, IntegerArray
+from mitsplat.arrays import AnyArray, BoolArray, Float64Array, IntegerArray
 
 Box = tuple[int, int, int, int]
 """Bounds (x0, y0, x1, y1) [px], half-open."""
@@ -105,17 +105,31 @@ def boundary_f1(one: BoolArray, other: BoolArray) -> float:
     2013, "What is a good evaluation measure for semantic segmentation?". The boundary of a mask consists of its pixels
     with a neighbour outside of the mask; the border of the array is no boundary.
     """
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BOUNDARY_TOLERANCE + 1,) * 2)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     edges = [mask & (cv2.erode(mask.astype(np.uint8), cross) == 0) for mask in (one, other)]
     counts = [int(np.count_nonzero(edge)) for edge in edges]
     if not all(counts):
         return float(counts[0] == counts[1])
     shares = [
-        np.count_nonzero(edge & (cv2.dilate(near.astype(np.uint8), disc) > 0)) / count
+        np.count_nonzero(edge & (cv2.dilate(near.astype(np.uint8), disc(BOUNDARY_TOLERANCE)) > 0)) / count
         for edge, near, count in zip(edges, reversed(edges), counts, strict=True)
     ]
     return float(2 * shares[0] * shares[1] / sum(shares)) if sum(shares) else 0.0
+
+
+def disc(radius: int) -> npt.NDArray[np.uint8]:
+    """Return a disc with a radius [px] as a structuring element of OpenCV."""
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2), dtype=np.uint8)
+
+
+def fill_hull(picture: npt.NDArray[np.uint8], pixels: Float64Array) -> None:
+    """Set a picture to 1 in the convex hull of pixels (N, 2)."""
+    cv2.fillConvexPoly(picture, np.rint(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32), 1)
+
+
+def border_of(image: AnyArray) -> AnyArray:
+    """Return the pixels along the border of an image (H, W, ...); those in its corners occur twice."""
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
 
 
 def without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, int]:

@@ -88,10 +88,9 @@ class MeshOutlines:
         """Return a rectangle that contains the silhouette: left, top, right and bottom [px]."""
         pixels, _ = camera.project(self._bounds)
         if not camera.is_pinhole or np.isnan(pixels).any():
-            return 0, 0, camera.width, camera.height
-        size = (camera.width, camera.height)
-        low = np.clip(np.floor(pixels.min(axis=0)) - 2, 0, size).astype(int)
-        high = np.clip(np.ceil(pixels.max(axis=0)) + 2, 0, size).astype(int)
+            return 0, 0, *camera.size
+        low = np.clip(np.floor(pixels.min(axis=0)) - 2, 0, camera.size).astype(int)
+        high = np.clip(np.ceil(pixels.max(axis=0)) + 2, 0, camera.size).astype(int)
         return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 

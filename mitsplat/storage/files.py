@@ -236,9 +236,14 @@ def remove_folder(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
+def write_bytes(path: Path, data: bytes) -> str:
+    """Write bytes by :func:`write_file`."""
+    return write_file(path, lambda temporary: temporary.write_bytes(data))
+
+
 def write_text(path: Path, text: str) -> str:
     """Write UTF-8 text by :func:`write_file`."""
-    return write_file(path, lambda temporary: temporary.write_bytes(text.encode()))
+    return write_bytes(path, text.encode())
 
 
 def files_below(folder: Path, *, skip: Path | None = None) -> list[Path]:

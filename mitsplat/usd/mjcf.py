@@ -188,7 +188,7 @@ def _camera(camera: Camera) -> ET.Element:
     frame = camera.world_from_camera @ OPENCV_FROM_OPENGL
     offset = (0.5 * camera.width - camera.cx, 0.5 * camera.height - camera.cy)
     values: dict[str, npt.ArrayLike] = {
-        "resolution": (camera.width, camera.height),
+        "resolution": camera.size,
         "focalpixel": (camera.fx, camera.fy),
         "principalpixel": offset,
         "sensorsize": (0.036, 0.036 * camera.height / camera.width),

@@ -328,7 +328,7 @@ class _StageWriter:
             prim.CreateFStopAttr(0.1 * focal / (2 * camera.aperture_radius))
             prim.CreateFocusDistanceAttr(camera.focus_distance)
         settings = UsdRender.Settings.Define(self.stage, "/Render/settings")
-        settings.CreateResolutionAttr(Gf.Vec2i(camera.width, camera.height))
+        settings.CreateResolutionAttr(Gf.Vec2i(*camera.size))
         settings.CreateAspectRatioConformPolicyAttr("adjustPixelAspectRatio")  # the focal lengths may differ
         settings.CreateCameraRel().SetTargets([prim.GetPath()])
         self.stage.SetMetadata("renderSettingsPrimPath", "/Render/settings")

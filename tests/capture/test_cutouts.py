@@ -156,7 +156,7 @@ def test_masks_are_taken_from_the_transparency(tmp_path: Path, orientation: int)
     good, _ = prepare(folder)
     width, height = good["r_0.png"].size
     lens = Camera(width, height, 100.0, 100.0, width / 2, height / 2, np.eye(4), distortion=(-0.1, 0.0, 0.0, 0.0))
-    make = cutout_masks(folder, good, dict.fromkeys(good, lens), list(good))
+    make = cutout_masks(folder, good, dict.fromkeys(good, lens))
     assert make is not None
     photo = Photo("r_0.png", good["r_0.png"].file, lens)
     with Image.open(photo.file) as copy:
@@ -173,7 +173,7 @@ def test_photos_without_transparent_pixels_have_no_such_masks(tmp_path: Path) ->
     for folder in (opaque, mixed):
         good, _ = prepare(folder)
         assert len(good) == 4
-        assert cutout_masks(folder, good, {}, list(good)) is None
+        assert cutout_masks(folder, good, dict.fromkeys(good)) is None  # type: ignore
 
 
 def test_masks_of_the_user_follow_the_removal_of_distortion(tmp_path: Path) -> None:

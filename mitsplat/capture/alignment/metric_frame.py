@@ -16,9 +16,11 @@ import numpy.typing as npt
 from mitsplat.arrays import Float64Array
 from mitsplat.capture.alignment.target_evidence import FrameEvidence, board_evidence, find_targets, tag_evidence
 from mitsplat.capture.boards.targets import Board
+from mitsplat.capture.capture import parse_pixel
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
-from mitsplat.geometry.triangulation import nearest_point_to_lines
+from mitsplat.geometry.rigid import homogeneous_matrix
+from mitsplat.geometry.triangulation import count_observers, nearest_point_to_lines
 
 DEFAULT_BOARD = Board()
 """Default board of `mitsplat board`."""
@@ -76,7 +78,7 @@ def find_metric_frame(
         images: Image files by the names of the model.
         board: Board to detect.
         tag: Edge length of AprilTags as printed, without their white border [m].
-        scale_from: Two points and their distance [m]; see :func:`spot`.
+        scale_from: Two points, see :func:`spot`, and their distance [m].
         centred: Put the origin below the point at which the cameras are directed; else in the middle of a board.
 
     Raises:
@@ -89,34 +91,25 @@ def find_metric_frame(
         evidence = tag_evidence(model, tag_views, tag)
     if evidence is None:
         evidence = FrameEvidence() if scale_from is None else _distance_evidence(model, scale_from)
-    scale, plane, source, board_pose = evidence.scale, evidence.plane, evidence.source, evidence.board
-    if plane is None and (table := find_table(model)) is not None:
-        plane = table
-        source += f"{', ' if source else ''}the table plane"
+    scale, board_pose = evidence.scale, evidence.board
+    plane = evidence.plane or find_table(model)
     centres, forward = _rays(model)
+    target = origin = nearest_point_to_lines(centres, forward)
     if plane is not None:
         normal, point = plane
         if np.median((centres - point) @ normal) < 0:
             normal = -normal
+        origin = target - (target - point) @ normal * normal if centred or board_pose is None else point
     else:
         upward = vertical_from_cameras(model)
-        normal, point = (np.array([0.0, -1.0, 0.0]) if upward is None else upward), np.zeros(3)
-        source += f"{', ' if source else ''}the cameras' attitude"
-    target = nearest_point_to_lines(centres, forward)
-    if plane is None:
-        origin = target
-    elif centred or board_pose is None:
-        origin = target - (target - point) @ normal * normal
-    else:
-        origin = point
+        normal = np.array([0.0, -1.0, 0.0]) if upward is None else upward
+    vertical = "" if evidence.plane else "the table plane" if plane else "the cameras' attitude"
     distance = float(np.median(np.linalg.norm(centres - target, axis=1)))
     if not distance > 0:
         raise InputError(f"the {len(centres)} cameras must not coincide with the point at which they are directed")
     factor = 1 / distance if scale is None else scale
     rotation = _upright_rotation(normal, forward[0] if board_pose is None else board_pose[:3, 0])
-    matrix = np.eye(4)
-    matrix[:3, :3] = factor * rotation
-    matrix[:3, 3] = -factor * rotation @ origin
+    matrix = homogeneous_matrix(factor * rotation, -factor * rotation @ origin)
     if board_pose is not None:
         board_pose = matrix @ board_pose
         board_pose[:3, :3] /= factor
@@ -125,7 +118,7 @@ def find_metric_frame(
         units="unknown" if scale is None else "metre",
         up="unknown" if plane is None else "z",
         table=plane is not None,
-        source=source,
+        source=", ".join(filter(None, (evidence.source, vertical))),
         scale_error=evidence.scale_error,
         wrong=evidence.wrong,
         confirmed=evidence.confirmed,
@@ -164,10 +157,7 @@ def spot(model: SparseModel, name: str) -> Float64Array:
     camera = model.cameras[photo]
     if not colon:
         return camera.centre
-    try:
-        x, y = map(float, pixel.split(","))
-    except ValueError:
-        raise InputError(f"{name}: a pixel must be given as X,Y (got {pixel})") from None
+    x, y = parse_pixel(pixel, name)
     seen = model.points[model.seen[photo]]
     pixels, depths = camera.project(seen)
     gaps = np.linalg.norm(pixels - (x, y), axis=1)
@@ -263,9 +253,7 @@ def _rays(model: SparseModel) -> tuple[Float64Array, Float64Array]:
 
 def _reliable_points(model: SparseModel) -> npt.NDArray[np.intp]:
     """Return the indices of points that at least three images observe, or of all points if observations are unknown."""
-    counts = np.zeros(len(model.points), dtype=np.int64)
-    for indices in model.seen.values():
-        counts[indices] += 1
+    counts = count_observers(model.seen.values(), len(model.points))
     return np.flatnonzero(counts >= 3 if counts.any() else counts == 0)
 
 

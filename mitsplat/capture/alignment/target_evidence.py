@@ -198,7 +198,7 @@ def _check_cameras(views: TargetViews, corners: Mapping[int, Float64Array]) -> t
         for name, (camera, pixel) in seen.items():
             error = np.linalg.norm(camera.project(corners[index])[0][0] - pixel)
             errors.setdefault(name, []).append(float(np.nan_to_num(error, nan=np.inf)))
-            edges[name] = max(camera.width, camera.height)
+            edges[name] = max(camera.size)
     shares = {name: float(np.median(found)) / edges[name] for name, found in errors.items() if len(found) >= 6}
     if not shares:
         return {}, frozenset()

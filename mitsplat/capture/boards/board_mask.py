@@ -49,7 +49,7 @@ def bare_squares(
     found = np.zeros(grey.shape, dtype=np.uint8)
     flat, shown = _rectify_board(board, world_from_board, camera, grey)
     printed = _draw_print(board)
-    corners = _board_points(board, np.arange(board.columns + 1.0), np.arange(board.rows + 1.0))
+    corners = board.points(np.arange(board.columns + 1), np.arange(board.rows + 1))
     pixels = _project_points(corners, world_from_board, camera)
     for row in range(board.rows):
         for column in range(board.columns):
@@ -80,12 +80,6 @@ def _matches_print(values: Float64Array, printed: Float64Array) -> bool:
     )
 
 
-def _board_points(board: Board, x: Float64Array, y: Float64Array) -> Float64Array:
-    """Return points on the board [m], shape (len(y), len(x), 3), at positions in squares from its upper left corner."""
-    across, down = np.meshgrid(x, y)
-    return np.stack([across - board.columns / 2, board.rows / 2 - down, np.zeros_like(down)], axis=-1) * board.square
-
-
 def _project_points(places: Float64Array, world_from_board: Float64Array, camera: Camera) -> Float64Array:
     """Return the pixel positions (..., 2) of points on the board (..., 3)."""
     pixels, _ = camera.project(transform_points(world_from_board, places.reshape(-1, 3)))
@@ -97,8 +91,8 @@ def _rectify_board(
 ) -> tuple[Float64Array, BoolArray]:
     """Return the rectified board in samples of the image, and the samples that lie inside the image."""
     x, y = ((np.arange(n * _SAMPLES) + 0.5) / _SAMPLES for n in (board.columns, board.rows))
-    pixels = _project_points(_board_points(board, x, y), world_from_board, camera)
-    shown = np.asarray(((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1))
+    pixels = _project_points(board.points(x, y), world_from_board, camera)
+    shown = camera.contains(pixels)
     steps = np.linalg.norm(np.diff(pixels, axis=1), axis=-1)[shown[:, 1:] & shown[:, :-1]]
     step = float(np.median(steps)) if len(steps) else 1.0
     smooth = cv2.GaussianBlur(grey, (0, 0), max(0.3, 0.4 * step))

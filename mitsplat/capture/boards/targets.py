@@ -66,9 +66,18 @@ class Board:
     @property
     def corners(self) -> Float64Array:
         """Inner corners on the board [m], shape (N, 3): origin in the middle, x right, y up, z out of the sheet."""
-        y, x = np.mgrid[1 : self.rows, 1 : self.columns].reshape(2, -1)
-        flat = np.column_stack([x - self.columns / 2, self.rows / 2 - y, np.zeros(len(x))])
-        return np.asarray(flat * self.square)
+        return self.points(np.arange(1, self.columns), np.arange(1, self.rows)).reshape(-1, 3)
+
+    def points(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Float64Array:
+        """Return points on the board [m], shape (len(y), len(x), 3), in the axes of :attr:`corners`.
+
+        Args:
+            x: Positions from the left border [squares].
+            y: Positions from the upper border [squares].
+        """
+        across, down = np.meshgrid(x, y)
+        places = np.stack([across - self.columns / 2, self.rows / 2 - down, np.zeros(down.shape)], axis=-1)
+        return np.asarray(places * self.square)
 
     def draw(self, dots: int) -> npt.NDArray[np.uint8]:
         """Draw the board without a margin, 8-bit grey.

@@ -11,14 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
-from mitsplat.arrays import BoolArray, Float64Array, Int32Array, Int64Array
+from mitsplat.arrays import Float64Array, Int32Array, Int64Array
 from mitsplat.capture.isolation.support import SupportSurface, find_support
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.clusters import cluster_points, gap_between
+from mitsplat.geometry.triangulation import count_observers
 
 _MAX_DISTANCE = 0.7
 """Maximum distance of considered points from the focus, as a fraction of the cameras' distance."""
@@ -105,13 +104,12 @@ def choose_object(
     focus, distance = focus_of([view.camera for view in views])
     if box is not None:
         focus = np.array(box, dtype=np.float64).reshape(2, 3).mean(axis=0)
-    counts, central = np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
+    counts, central = count_observers([view.seen for view in views], len(points)), np.zeros(len(points))
     for view in views:
         camera, shown = view.camera, view.seen
         pixels, _ = camera.project(points[shown])
-        away = np.linalg.norm(pixels - (camera.width / 2, camera.height / 2), axis=1)
-        counts[shown] += 1
-        central[shown] += np.exp(-0.5 * (away / (_IMAGE_SIGMA * max(camera.width, camera.height))) ** 2)
+        away = np.linalg.norm(pixels - np.array(camera.size) / 2, axis=1)
+        central[shown] += np.exp(-0.5 * (away / (_IMAGE_SIGMA * max(camera.size))) ** 2)
     near = (counts >= 3) & (np.linalg.norm(points - focus, axis=1) < _MAX_DISTANCE * distance)
     support = find_support(points[near], focus, _MAX_DISTANCE * distance)
     height = points[:, 2] - support.under(points)
@@ -123,12 +121,14 @@ def choose_object(
             f"no object was found above its support in the photos ({np.count_nonzero(stands)} points above it): give "
             "masks, or take photos of one object with texture on and below it"
         )
-    cluster, count = _cluster_objects(points, stands, distance)
+    gap = gap_between(points[stands], *(bound * distance for bound in _GAP_BOUNDS))
+    cluster = np.full(len(points), -1, dtype=np.int64)
+    cluster[stands] = cluster_points(points[stands], gap)
     if picks:
         chosen = np.unique([_picked_cluster(pick, points, cluster) for pick in picks])
     else:
         away = np.linalg.norm(points[stands] - focus, axis=1) / (_FOCUS_SIGMA * distance)
-        scores = np.bincount(cluster[stands], central[stands] * np.exp(-0.5 * away**2), count)
+        scores = np.bincount(cluster[stands], central[stands] * np.exp(-0.5 * away**2))
         for pick in picks_not:
             scores[_picked_cluster(pick, points, cluster)] = -1
         chosen = np.array([int(scores.argmax())])
@@ -162,29 +162,12 @@ def focus_of(cameras: Sequence[Camera]) -> tuple[Float64Array, float]:
     return focus, float(np.median(np.linalg.norm(centres - focus, axis=1)))
 
 
-def _cluster_objects(points: Float64Array, stands: BoolArray, distance: float) -> tuple[Int64Array, int]:
-    """Cluster the points into objects.
-
-    Returns:
-        Index of the object of each point (N,), -1 for none, and the number of objects.
-    """
-    tree = KDTree(points[stands])
-    gap = 4 * float(np.median(tree.query(points[stands], k=6)[0][:, -1]))
-    gap = min(max(gap, _GAP_BOUNDS[0] * distance), _GAP_BOUNDS[1] * distance)
-    pairs = tree.query_pairs(gap, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(tree.n, tree.n))
-    count, label = connected_components(graph, directed=False)
-    cluster = np.full(len(points), -1, dtype=np.int64)
-    cluster[stands] = label
-    return cluster, int(count)
-
-
 def _picked_cluster(pick: Pick, points: Float64Array, cluster: Int64Array) -> int:
     """Return the index of the object nearest to a pixel of a photo."""
     camera = pick.view.camera
     shown = pick.view.seen[cluster[pick.view.seen] >= 0]
     gaps = np.linalg.norm(camera.project(points[shown])[0] - pick.pixel, axis=1)
-    limit = _PICK_RADIUS * max(camera.width, camera.height)
+    limit = _PICK_RADIUS * max(camera.size)
     if not len(gaps) or not gaps.min() < limit:
         raise InputError(f"{pick.name}: the photo observes no point of an object within {limit:.0f} px of this pixel")
     return int(cluster[shown[int(gaps.argmin())]])

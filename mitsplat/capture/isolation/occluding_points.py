@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.geometry.camera import Camera
+from mitsplat.images.masks import disc, fill_hull
 
 _EDGE = 128
 """Longer edge of the object in the picture in which fractions are counted [px]."""
@@ -52,7 +52,7 @@ def occluded_part(camera: Camera, own: Float64Array, others: Sequence[Float64Arr
 
     edge = 2 * _EDGE
     outline, hidden, possible = (np.zeros((edge, edge), dtype=np.uint8) for _ in range(3))
-    _fill_hull(outline, placed(pixels))
+    fill_hull(outline, placed(pixels))
     middle = float(np.median(depths))
     for points in others:
         pixels, depths = camera.project(points)
@@ -64,23 +64,14 @@ def occluded_part(camera: Camera, own: Float64Array, others: Sequence[Float64Arr
         x, y = near.astype(np.intp).T
         dots = np.zeros_like(outline)
         dots[y, x] = 1
-        closed = cv2.morphologyEx(dots, cv2.MORPH_CLOSE, _disc(gap), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        closed = cv2.morphologyEx(dots, cv2.MORPH_CLOSE, disc(gap), borderType=cv2.BORDER_CONSTANT, borderValue=0)
         hidden |= closed > 0
         between = np.zeros_like(outline)
-        _fill_hull(between, near)
-        possible |= cv2.dilate(between, _disc(gap // 2)) > 0
+        fill_hull(between, near)
+        possible |= cv2.dilate(between, disc(gap // 2)) > 0
     # Pixel centres are at +0.5 here, and at integers in OpenCV.
     x, y = step * (0.5 - low) + _EDGE / 2 - 0.5
     back = np.array([[step, 0, x], [0, step, y]])
-    seen = cv2.warpAffine(possible, back, (camera.width, camera.height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+    seen = cv2.warpAffine(possible, back, camera.size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
     occluded, possibly_occluded = (float(part[outline > 0].mean()) for part in (hidden, possible))
     return occluded, possibly_occluded, np.asarray(seen > 0)
-
-
-def _fill_hull(picture: npt.NDArray[np.uint8], pixels: Float64Array) -> None:
-    """Set a picture to 1 in the convex hull of pixels (N, 2)."""
-    cv2.fillConvexPoly(picture, np.rint(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32), 1)
-
-
-def _disc(radius: int) -> npt.NDArray[np.uint8]:
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), dtype=np.uint8)

@@ -92,7 +92,7 @@ def _number(known: dict[int, object], tag: int) -> float | None:
     return number if 0 < number < np.inf else None
 
 
-def exposures_of(photographs: Sequence[Photograph], stated: Sequence[float] | None = None) -> Float64Array:
+def exposures_of(photographs: Sequence[Photograph], stated: Sequence[float] | None) -> Float64Array:
     """Return the exposures of photographs of equal size: ``stated`` if given, else those of EXIF.
 
     Raises:

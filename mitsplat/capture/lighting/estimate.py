@@ -226,11 +226,9 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
         The written files.
     """
     picture_file, panorama, rest = _output_files(out)
-    image = panorama.name
     files = [out, picture_file, panorama]
     write_radiance(panorama, estimate.panorama)
     if estimate.lamps and estimate.settings.rest == "image":
-        image = rest.name
         files.append(rest)
         write_radiance(rest, estimate.rest)
     shown = _draw_lamps(estimate)
@@ -239,8 +237,8 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
         beside = cv2.resize(photograph, (width, len(shown)), interpolation=cv2.INTER_AREA)
         shown = np.hstack([np.asarray(beside), shown])
     picture = Image.fromarray(shown)
-    write_file(files[1], lambda part: picture.save(part, "PNG"))
-    write_text(out, light_lines(estimate, image))
+    write_file(picture_file, lambda part: picture.save(part, "PNG"))
+    write_text(out, light_lines(estimate, files[-1].name))
     return files
 
 

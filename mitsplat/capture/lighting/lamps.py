@@ -15,11 +15,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
+from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.capture.lighting.panorama import (
     angles,
     directions,
@@ -28,6 +26,7 @@ from mitsplat.capture.lighting.panorama import (
     resized,
     solid_angles,
 )
+from mitsplat.geometry.clusters import cluster_points
 from mitsplat.images.colour import LUMINANCE
 
 CONTRAST = 4.0
@@ -86,7 +85,7 @@ class Lamp:
         return width, height
 
 
-def take_lamps(panorama: Float32Array, *, rotate_z: float = 0.0, most: int = 6) -> tuple[list[Lamp], Float32Array]:
+def take_lamps(panorama: Float32Array, *, rotate_z: float, most: int) -> tuple[list[Lamp], Float32Array]:
     """Extract the lamps of a panorama and replace them by the radiance of their surroundings.
 
     Lamps and the remaining panorama together give a horizontal plane the same irradiance as the panorama.
@@ -104,7 +103,7 @@ def take_lamps(panorama: Float32Array, *, rotate_z: float = 0.0, most: int = 6) 
     coarse = resized(panorama, *shape)
     sight = directions(*shape, rotate_z)
     bright = _lamp_pixels(coarse)
-    groups = _group_pixels(sight[bright])
+    groups = cluster_points(sight[bright], 2 * np.sin(np.radians(_GAP) / 2))
     everywhere, weights = directions(height, width, rotate_z), level_weights(height, width)
     total = level_irradiance(panorama) @ LUMINANCE
     found: list[tuple[Lamp, Float64Array]] = []
@@ -138,13 +137,6 @@ def _lamp_pixels(panorama: Float32Array) -> BoolArray:
         if (brighter == bright).all():
             return bright
         bright = brighter
-
-
-def _group_pixels(points: Float32Array) -> Int32Array:
-    """Return the group index of each unit vector (N,); vectors less than ``_GAP`` apart are in one group."""
-    pairs = cKDTree(points).query_pairs(2 * np.sin(np.radians(_GAP) / 2), output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(points), len(points)))
-    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def _ring_radiance(panorama: Float32Array, sight: Float32Array, own: BoolArray, bright: BoolArray) -> Float64Array:

@@ -18,6 +18,7 @@ from scipy.ndimage import maximum_filter
 from mitsplat.arrays import BoolArray, ByteImage, Float32Array, Float64Array
 from mitsplat.capture.lighting.panorama import directions, resized, solid_angles, unit_vector
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import homogeneous_matrix
 
 WIDTH = 1024
 """Width of ball panoramas [px]."""
@@ -223,7 +224,5 @@ def _ball_camera(width: int, height: int, ball: Circle, focal: float, towards: F
     yaw = np.arctan2(ahead[1], ahead[0]) + np.arctan2(x, level)
     forward = unit_vector(float(np.degrees(yaw)), float(np.degrees(pitch)))
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = distance * towards
+    pose = homogeneous_matrix(np.stack([right, np.cross(forward, right), forward], axis=1), distance * towards)
     return Camera(width, height, focal, focal, width / 2, height / 2, pose), float(distance)

@@ -317,10 +317,8 @@ def _find_model(
         The sparse model without cameras that contradict the other cameras or the board, its metric frame, and the
         reason for each file without a camera.
     """
-    faults: dict[str, str] = {}
-    if given is not None:
-        model = given
-    else:
+    model, faults = given, dict[str, str]()
+    if model is None:
         model, faults = _remove_faulty_cameras(find_cameras(list(by_file.values()), work, progress))
     _check_camera_count(photos, model, by_file, faults)
     frame = _metric_frame(model, by_file, settings)
@@ -407,25 +405,23 @@ def _with_masks(
     out: Path,
     progress: Progress | None,
 ) -> Capture:
-    mask_folder = out / "masks"
+    """Add masks of the object: given by the user, by a network, by the photos themselves, or from points on it."""
+    add = partial(add_masks, capture, folder=out / "masks", progress=progress)
     if settings.masks is not None:
-        given = given_masks(settings.masks, prepared, lenses)
-        return check_borders(add_masks(capture, given, mask_folder, progress=progress), settings.masks)
+        return check_borders(add(given_masks(settings.masks, prepared, lenses)), settings.masks)
     if settings.mask_model is not None:
-        return add_masks(capture, model_masks(settings.mask_model), mask_folder, progress=progress)
+        return add(model_masks(settings.mask_model))
     if not settings.has_hints:
-        cut = cutout_masks(source, prepared, lenses, list(lenses))
-        if cut is not None:
-            return check_borders(add_masks(capture, cut, mask_folder, progress=progress), source)
-        if settings.poses is not None and frame.board is None:
-            cut = plain_masks(capture.photos)
-        if cut is not None:
-            return add_masks(capture, cut, mask_folder, progress=progress)
-    if not frame.table and not settings.has_hints:
-        raise InputError(
-            "no table was found below the object to segment it: pick it (--pick), give masks (--masks or "
-            "--mask-model), place it on a textured surface, or capture it as an environment (--kind environment)"
-        )
+        if (cut := cutout_masks(source, prepared, lenses)) is not None:
+            return check_borders(add(cut), source)
+        is_rendered = settings.poses is not None and frame.board is None
+        if is_rendered and (plain := plain_masks(capture.photos)) is not None:
+            return add(plain)
+        if not frame.table:
+            raise InputError(
+                "no table was found below the object to segment it: pick it (--pick), give masks (--masks or "
+                "--mask-model), place it on a textured surface, or capture it as an environment (--kind environment)"
+            )
     hidden: dict[str, BoolArray] = {}
     bare = None if frame.board is None else partial(bare_squares, settings.board, frame.board)
     if frame.board is not None and not settings.has_hints:
@@ -435,7 +431,7 @@ def _with_masks(
         chosen = chosen_object(capture, settings.picks, settings.picks_not, settings.box)
         points, above = chosen.points, chosen.above
         capture, hidden = _reject_occluded(capture, chosen)
-    return object_masks(capture, points, above, mask_folder, bare=bare, hidden=hidden, progress=progress)
+    return object_masks(capture, points, above, out / "masks", bare=bare, hidden=hidden, progress=progress)
 
 
 def _reject_occluded(capture: Capture, chosen: ChosenObject) -> tuple[Capture, dict[str, BoolArray]]:

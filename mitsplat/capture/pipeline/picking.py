@@ -68,10 +68,7 @@ def pick_along(capture: Capture, origin: npt.ArrayLike, direction: npt.ArrayLike
     if not shown:
         raise InputError("no photo of the capture observes the point at this position: click on another point")
 
-    def likeness(world_place: npt.NDArray[np.float64]) -> float:
-        towards = capture.points[point] - world_place
-        return float(towards @ ahead / np.linalg.norm(towards))
-
-    photo = max(shown, key=lambda photo: likeness(photo.camera.centre))
+    towards = capture.points[point] - np.array([photo.camera.centre for photo in shown])
+    photo = shown[int((towards @ ahead / np.linalg.norm(towards, axis=1)).argmax())]
     (x, y), *_ = photo.camera.project(capture.points[point][None])[0]
     return f"{photo.name}:{x:.0f},{y:.0f}"

@@ -11,9 +11,7 @@ A damaged video can abort the process that decodes it, and decoders write messag
 from __future__ import annotations
 
 import json
-import resource
 import sys
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -25,10 +23,11 @@ from mitsplat.capture.video.frame_selection import STEP, Choice, FrameMeasure, c
 from mitsplat.capture.video.motion import MotionClock
 from mitsplat.capture.video.sharpness import sharpness
 from mitsplat.errors import InputError
-from mitsplat.storage.files import write_file
+from mitsplat.runtime.child_process import limit_memory
+from mitsplat.storage.files import write_bytes
 
 _MEMORY = 12 << 30
-"""Address space limit [bytes]; decoders of large frames reserve some for each thread."""
+"""Address space for decoding [bytes]; decoders of large frames reserve some for each thread."""
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
@@ -91,15 +90,11 @@ def _write(video: Path, folder: Path, choice: Choice) -> list[str]:
         for index, _ in reader.times():
             if index in names:
                 _, coded = cv2.imencode(".jpg", reader.picture(), _JPEG)
-                write_file(folder / names[index], partial(_write_bytes, coded.tobytes()))
+                write_bytes(folder / names[index], coded.tobytes())
                 _send(progress=(index + 1, max(index + 1, reader.stated), "taking frames of the video"))
             if index >= choice.frames[-1].index:
                 break
     return list(names.values())
-
-
-def _write_bytes(data: bytes, file: Path) -> None:
-    file.write_bytes(data)
 
 
 def _name(time: float) -> str:
@@ -114,6 +109,5 @@ def _send(**message: object) -> None:
 
 
 if __name__ == "__main__":
-    _, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY if hard == resource.RLIM_INFINITY else min(_MEMORY, hard), hard))
+    limit_memory(_MEMORY)
     main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))

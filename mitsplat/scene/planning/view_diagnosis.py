@@ -25,7 +25,7 @@ def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
     grid = np.stack(np.meshgrid(*([np.linspace(0, 1, 9)] * 3), indexing="ij"), axis=-1).reshape(-1, 3)
     pixels, depth = camera.project(low + grid * (high - low))
     with np.errstate(invalid="ignore"):
-        shown = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1) & (depth > camera.near)
+        shown = camera.contains(pixels) & (depth > camera.near)
     if shown.any():
         return True
     across = np.stack(np.meshgrid(np.linspace(0, camera.width, 17), np.linspace(0, camera.height, 17)), axis=-1)

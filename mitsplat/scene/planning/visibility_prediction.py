@@ -272,7 +272,7 @@ def _local(point: Float64Array, pose: Float64Array) -> Float64Array:
 
 def _within(x: Float64Array, y: Float64Array, camera: Camera, margin: int) -> BoolArray:
     """Return a mask of the pixels in the image of a camera, extended on each side by ``margin`` image sizes."""
-    width, height = camera.width, camera.height
+    width, height = camera.size
     inside = (x >= -margin * width) & (x < (1 + margin) * width)
     return np.asarray(inside & (y >= -margin * height) & (y < (1 + margin) * height))
 

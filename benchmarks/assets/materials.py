@@ -38,8 +38,9 @@ from scipy.spatial import KDTree
 from benchmarks.light.shadow_scenes import ROOT, block, coverage, lights_of, pose, worn
 from benchmarks.light.shadows import psnr, save_sheet
 from benchmarks.record import figure, recording
-from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, part_shape, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_parts
 from mitsplat.bake.mesh_surface import MeshSurface
+from mitsplat.bake.part_shapes import bake_lights, mitsuba_scene, part_shape
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_basis
 from mitsplat.gaussians.splat_cloud import Splats

@@ -43,8 +43,8 @@ from benchmarks.assets.materials import (
 from benchmarks.assets.refine_mesh import masked
 from benchmarks.light.shadow_scenes import ROOT, coverage
 from benchmarks.record import figure, recording
-from mitsplat.bake.mesh_parts import mitsuba_scene
 from mitsplat.bake.mesh_surface import MeshSurface
+from mitsplat.bake.part_shapes import mitsuba_scene
 from mitsplat.capture.capture import Capture
 from mitsplat.fit.trainer import FitSettings, fit_capture
 from mitsplat.gaussians.splat_cloud import Splats

@@ -28,7 +28,8 @@ from scipy.spatial import KDTree
 from benchmarks.detector.experiment import write_scene
 from benchmarks.detector.material import wanted_assets
 from mitsplat.asset import Asset
-from mitsplat.bake.mesh_parts import MeshPart, part_shape, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.part_shapes import part_shape
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import Frame
 from mitsplat.gaussians.spherical_harmonics import SH_C0

@@ -36,7 +36,8 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.assets.photographing import Sensors
 from benchmarks.light.shadow_scenes import block, nearest_object, placed, shipped, worn
 from benchmarks.record import ROOT, figure, recording
-from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.part_shapes import bake_lights, mitsuba_scene
 from mitsplat.capture.lighting.panorama import unit_vector
 from mitsplat.geometry.camera import Camera
 from mitsplat.physics.settle import settle_layout

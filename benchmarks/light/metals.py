@@ -36,7 +36,8 @@ import trimesh
 from benchmarks.light.shadow_scenes import LIGHTS, ROOT, SKY, block, coverage, pose
 from benchmarks.light.shadows import Photographer, difference, psnr, save_sheet
 from benchmarks.record import figure, recording
-from mitsplat.bake.mesh_parts import MeshPart, bake_lights, part_shape
+from mitsplat.bake.mesh_parts import MeshPart
+from mitsplat.bake.part_shapes import bake_lights, part_shape
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import place_surfels

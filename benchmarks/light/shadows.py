@@ -46,7 +46,8 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, max
 
 # isort: on
 from benchmarks.record import figure, recording
-from mitsplat.bake.mesh_parts import MeshPart, bake_lights, mitsuba_scene, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.part_shapes import bake_lights, mitsuba_scene
 from mitsplat.frames.camera_response import lit_picture
 from mitsplat.frames.scene_builder import make_asset_shape
 from mitsplat.geometry.camera import Camera

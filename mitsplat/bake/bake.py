@@ -21,8 +21,9 @@ import trimesh
 from mitsplat.arguments import check_fields, check_least, check_list, check_number, check_text, check_type
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, MeshModel, MeshPart, bake_lights, mitsuba_scene, read_model
+from mitsplat.bake.mesh_parts import MeshModel, MeshPart, read_model
 from mitsplat.bake.mesh_surface import MeshSurface
+from mitsplat.bake.part_shapes import UNIFORM_LIGHT, bake_lights, mitsuba_scene
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.bake.radiance import BOUNCES, bake_radiance, hemisphere, ray_offset, rotate_directions
 from mitsplat.bake.size_checks import check_size, mass_warnings
@@ -218,7 +219,8 @@ def bake_asset(
         brightness, different = compare_with_textures(model.parts, splats, surface.parts_of(surfels.faces))
         result = replace(result, brightness=brightness)
         warnings += _texture_warnings(different)
-    stages.end()
+    if progress is not None:
+        progress(100, 100, "done")
     return replace(result, warnings=tuple(warnings))
 
 
@@ -325,11 +327,6 @@ class _Stages:
     def step(self, done: int, total: int, stage: str) -> None:
         """Report that ``done`` of ``total`` steps of a stage are complete."""
         self(stage, done / total)
-
-    def end(self) -> None:
-        """Report the end."""
-        if self._progress is not None:
-            self._progress(100, 100, "done")
 
 
 def _describe_units(model: MeshModel) -> str:

@@ -1,4 +1,4 @@
-"""CAD meshes as Mitsuba scenes: their parts with materials, and the lights of the bake."""
+"""CAD meshes as parts in metres, each with one material."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import mitsuba as mi
 import numpy as np
 import trimesh
 
@@ -18,7 +17,7 @@ from mitsplat.gaussians.splat_materials import MAX_SPECULAR
 from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.coplanar import coplanar_place
 from mitsplat.geometry.mesh_normals import corner_normals
-from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.images.colour import decode_srgb
 from mitsplat.mesh_files.mesh_file import (
     DIELECTRIC_SPECULAR,
     OPAQUE,
@@ -30,10 +29,6 @@ from mitsplat.mesh_files.mesh_file import (
 )
 from mitsplat.mesh_files.mesh_reading import read_mesh_file
 from mitsplat.mesh_files.trimesh_files import scene_parts
-from mitsplat.renderer.rays.device_arrays import ray_scene
-from mitsplat.renderer.scene_emitters import MitsubaDict, emitter_dict
-from mitsplat.runtime.variant import ensure_variant
-from mitsplat.scene.spec.light_spec import LightSpec
 
 _MAX_POSITION = 1e10
 """Largest coordinate [units of the file] at which vertices can be merged by their positions."""
@@ -43,10 +38,7 @@ _MAX_STEP = 1e-3
 """Maximum step of stored positions relative to the size of the mesh."""
 _MAX_DISTANCE = 1000.0
 """Distance from the origin, relative to the size of the mesh, beyond which 32-bit numbers are too coarse to render."""
-_WHITE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
-UNIFORM_LIGHT: MitsubaDict = {"light": {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}}
-"""Emitter of radiance 1 from all directions."""
-_LINEAR = decode_srgb(np.arange(256) / 255.0)
+LINEAR_LEVELS = decode_srgb(np.arange(256) / 255.0)
 """Linear values of 8-bit display-encoded values."""
 _DETAIL_SAMPLES = 12
 _DETAIL_CONTRAST = 0.12
@@ -102,7 +94,7 @@ class MeshPart:
             return np.asarray(np.einsum("nk,nkc->nc", barycentric, self.colours[faces]))
         if self.texture is None:
             raise InputError(f"part {self.name} has neither colours nor a texture")
-        return np.asarray(_LINEAR[self.texture.at(faces, barycentric)] * self.factor)
+        return np.asarray(LINEAR_LEVELS[self.texture.at(faces, barycentric)] * self.factor)
 
     def materials_at(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
         """Return metallic, roughness and specular of ``principled``, shape (N, 3); 0, 1 and 0 for matt parts."""
@@ -259,19 +251,19 @@ def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> 
     elif painted is not None and (painted < OPAQUE).any():
         warnings.append(f"part {name!r} has a texture and vertex colours: the vertex colours are ignored")
     return MeshPart(
-        name,
-        mesh,
-        colours,
-        texture,
-        material.metallic,
-        material.roughness,
-        material.shiny,
-        min(material.specular, MAX_SPECULAR),
-        tuple(warnings),
-        material.factor if texture is not None else 1.0,
-        select(material.metallic_roughness),
-        select(material.normal_map),
-        source.double_sided and not (mesh.is_watertight and mesh.volume > 0),
+        name=name,
+        mesh=mesh,
+        colours=colours,
+        texture=texture,
+        metallic=material.metallic,
+        roughness=material.roughness,
+        shiny=material.shiny,
+        reflectance=min(material.specular, MAX_SPECULAR),
+        warnings=tuple(warnings),
+        factor=material.factor if texture is not None else 1.0,
+        metallic_roughness=select(material.metallic_roughness),
+        normal_map=select(material.normal_map),
+        double_sided=source.double_sided and not (mesh.is_watertight and mesh.volume > 0),
     )
 
 
@@ -355,106 +347,3 @@ def _inverted_bodies(parts: Sequence[MeshPart]) -> Iterator[str]:
                 f"a closed body of {size} mm in part {names[index]!r} is inside out, so that it gets no Gaussians: "
                 "reverse its faces in the program that wrote the file"
             )
-
-
-def mitsuba_scene(parts: Sequence[MeshPart], lights: MitsubaDict, *, clay: bool = False) -> mi.Scene:
-    """Create a Mitsuba scene of ``parts`` under emitters ``lights``.
-
-    Metals and plastics are ``principled`` BSDFs. With ``clay``, all parts have a white diffuse BSDF instead.
-    """
-    ensure_variant()
-    shapes = {
-        f"part_{k}": _mitsuba_mesh(part, _clay(part)) if clay else part_shape(part) for k, part in enumerate(parts)
-    }
-    return ray_scene({**shapes, **lights})
-
-
-def part_shape(part: MeshPart) -> mi.Mesh:
-    """Create the Mitsuba shape of a part in its own material."""
-    return _mitsuba_mesh(part, _bsdf(part))
-
-
-def _clay(part: MeshPart) -> MitsubaDict:
-    return {"type": "twosided", "bsdf": _WHITE} if part.double_sided else _WHITE
-
-
-def _bsdf(part: MeshPart) -> MitsubaDict:
-    if part.texture is not None:
-        pixels = (255.0 * encode_srgb(_LINEAR[part.texture.pixels] * part.factor)).round().astype(np.uint8)
-        colour = _bitmap(part, replace(part.texture, pixels=pixels), raw=False)
-    else:
-        colour = {"type": "mesh_attribute", "name": "vertex_color"}
-    bsdf: MitsubaDict = {"type": "diffuse", "reflectance": colour}
-    if part.shiny:
-        bsdf = {
-            "type": "principled",
-            "base_color": colour,
-            "metallic": _channel(part, 0, part.metallic),
-            "roughness": _channel(part, 1, part.roughness),
-            "specular": part.reflectance / MAX_SPECULAR,
-        }
-    return {"type": "twosided", "bsdf": bsdf} if part.double_sided else bsdf
-
-
-def _channel(part: MeshPart, number: int, uniform: float) -> float | MitsubaDict:
-    """Return a channel of the texture of metalness and roughness, or the uniform value if there is none."""
-    texture = part.metallic_roughness
-    if texture is None:
-        return uniform
-    return _bitmap(part, replace(texture, pixels=np.ascontiguousarray(texture.pixels[..., number, None])), raw=True)
-
-
-def _bitmap(part: MeshPart, texture: Texture, *, raw: bool) -> MitsubaDict:
-    """Return Mitsuba's description of a texture.
-
-    Raises:
-        InputError: If Mitsuba cannot represent it, because two textures of a part have different coordinates, or an
-            image continues differently along its two axes.
-    """
-    low, high = texture.uv.min(axis=(0, 1)), texture.uv.max(axis=(0, 1))
-    wraps = {wrap for wrap, first, last in zip(texture.wrap, low, high, strict=True) if first < 0 or last > 1}
-    uv = _uv_of(part)
-    if len(wraps) > 1 or uv is None or not np.array_equal(texture.uv, uv):
-        raise InputError(
-            f"part {part.name!r}: to bake the light of a scene, all its textures must have the same coordinates and "
-            "the same wrap mode along both axes: bake it without lights"
-        )
-    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texture.pixels), "raw": raw}
-    return {**bitmap, "wrap_mode": wraps.pop()} if wraps else bitmap
-
-
-def _uv_of(part: MeshPart) -> Float64Array | None:
-    """Return the texture coordinates (F, 3, 2) of the first texture of a part that its BSDF uses, or None."""
-    textures = (part.texture, part.metallic_roughness if part.shiny else None)
-    return next((texture.uv for texture in textures if texture is not None), None)
-
-
-def _mitsuba_mesh(part: MeshPart, bsdf: MitsubaDict) -> mi.Mesh:
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
-    count, uv = len(part.mesh.faces), _uv_of(part)
-    mesh = mi.Mesh(
-        part.name, 3 * count, count, props=properties, has_vertex_normals=True, has_vertex_texcoords=uv is not None
-    )
-    if part.colours is not None:
-        mesh.add_attribute("vertex_color", 3, np.ravel(part.colours).astype(np.float32))
-    buffers = mi.traverse(mesh)
-    buffers["vertex_positions"] = np.ravel(part.mesh.triangles).astype(np.float32)
-    buffers["vertex_normals"] = np.ravel(corner_normals(part.mesh)).astype(np.float32)
-    if uv is not None:
-        buffers["vertex_texcoords"] = np.ravel(uv * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
-    buffers["faces"] = np.arange(3 * count, dtype=np.uint32)
-    buffers.update()
-    return mesh
-
-
-def bake_lights(lights: Sequence[LightSpec]) -> MitsubaDict:
-    """Return the Mitsuba emitters of a scene's lights, by name.
-
-    Raises:
-        InputError: If there is no light at all.
-    """
-    ensure_variant()
-    if not lights:
-        raise InputError("a scene whose lights are baked needs at least one light (got none)")
-    return {f"light_{k}": emitter_dict(spec) for k, spec in enumerate(lights)}

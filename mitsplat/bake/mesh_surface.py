@@ -90,24 +90,24 @@ class MeshSurface:
 
     def base_colours(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
         """Return linear base colours (N, 3) at points of faces."""
-        return self._gather(lambda part, *at: part.colours_at(*at), 3, faces, barycentric)
+        return self._gather(MeshPart.colours_at, faces, barycentric)
 
     def materials(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
         """Return metallic, roughness and specular, shape (N, 3)."""
-        return self._gather(lambda part, *at: part.materials_at(*at), 3, faces, barycentric)
+        return self._gather(MeshPart.materials_at, faces, barycentric)
 
     def normals(self, faces: Int64Array, barycentric: Float64Array) -> Float64Array:
         """Return shading normals (N, 3), with the normal maps applied."""
-        return self._gather(lambda part, *at: part.normals_at(*at), 3, faces, barycentric)
+        return self._gather(MeshPart.normals_at, faces, barycentric)
 
     def _gather(
         self,
         values: Callable[[MeshPart, Int64Array, Float64Array], Float64Array],
-        width: int,
         faces: Int64Array,
         barycentric: Float64Array,
     ) -> Float64Array:
-        found = np.zeros((len(faces), width))
+        """Return the values (N, 3) of each part at points of its faces."""
+        found = np.zeros((len(faces), 3))
         for part, first, end in zip(self._parts, self._first, self._first[1:], strict=False):
             own = np.flatnonzero((faces >= first) & (faces < end))
             if len(own):

@@ -35,7 +35,7 @@ _RIDGE_WEIGHT = 0.02
 
 def bake_radiance(scene: mi.Scene, surfels: Surfels, rng: np.random.Generator, progress: Progress) -> Splats:
     """Return splats with the radiance that leaves the surfels."""
-    return surfels.splats(_sharpen_colours(surfels, _fit_radiance(scene, surfels, rng, progress), _SHARPENING))
+    return surfels.splats(_sharpen_colours(surfels, _fit_radiance(scene, surfels, rng, progress)))
 
 
 def hemisphere(count: int) -> Float64Array:
@@ -122,12 +122,12 @@ def _fit_radiance(scene: mi.Scene, surfels: Surfels, rng: np.random.Generator, p
     return coefficients
 
 
-def _sharpen_colours(surfels: Surfels, target: Float64Array, rounds: int) -> Float64Array:
+def _sharpen_colours(surfels: Surfels, target: Float64Array) -> Float64Array:
     """Return colours (N, K, 3) whose blend at every surfel approximates ``target`` (N, K, 3).
 
     Van Cittert's iteration. Colours are clamped to the range of their neighbours, which prevents ringing.
     """
-    if not rounds or len(surfels) < 2:
+    if len(surfels) < 2:
         return target
     neighbours = min(16, len(surfels))
     _, index = KDTree(surfels.points).query(surfels.points, k=neighbours, workers=-1)
@@ -141,7 +141,7 @@ def _sharpen_colours(surfels: Surfels, target: Float64Array, rounds: int) -> Flo
         goal, now = target[:, band], colour[:, band]
         around = goal[index]
         low, high = around.min(axis=1), around.max(axis=1)
-        for _ in range(rounds):
+        for _ in range(_SHARPENING):
             now = np.clip(now + 0.7 * (goal - np.einsum("nk,nkc->nc", blend, now[index])), low, high)
         colour[:, band] = now
     return colour

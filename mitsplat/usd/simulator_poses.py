@@ -239,13 +239,13 @@ def _layout(
         raise InputError(f"the poses must be those of the model's {len(names)} bodies (got {len(poses)} poses)")
     instances = []
     for number, (body, asset) in sorted(placed.items()):
-        row, pose = poses[body], np.eye(4)
+        row = poses[body]
         if not np.isfinite(row).all():
             raise InputError(
                 f"body {names[body]!r}: must have a finite pose (got {row.tolist()}); has the simulation diverged?"
             )
         if abs((length := np.linalg.norm(row[3:])) - 1.0) > _UNIT:
             raise InputError(f"body {names[body]!r}: must have a quaternion of length 1 (got {length:.6g}); {remedy}")
-        pose[:3, :3], pose[:3, 3] = Rotation.from_quat(row[3:]).as_matrix(), row[:3]
+        pose = homogeneous_matrix(Rotation.from_quat(row[3:]).as_matrix(), row[:3])
         instances.append(Instance(number, asset, scene.class_index(asset), pose))
     return Layout(index, tuple(instances), NO_PHYSICS)

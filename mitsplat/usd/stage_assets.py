@@ -21,7 +21,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.geometry.mesh import mass_properties, prepare_mesh
-from mitsplat.geometry.rigid import split_similarity
+from mitsplat.geometry.rigid import homogeneous_matrix, split_similarity
 from mitsplat.storage.files import JsonObject
 from mitsplat.usd.stage_physics import Record
 from mitsplat.usd.stage_records import read_records
@@ -35,6 +35,8 @@ _INERTIA_TOLERANCE = 0.02
 """Tolerated difference of the inertia, and of the centre of mass over the size, from those of a uniform density."""
 _DEFAULT_FRICTION = 0.5
 
+_STATED = ("rolling_friction", "torsional_friction", "roughness", "specular", "white")
+"""Values of an asset that the stage states alone, if at all."""
 _logger = logging.getLogger(__name__)
 
 
@@ -87,10 +89,7 @@ def read_stage_asset(path: Path) -> StageAsset:
 
 def body_frames(path: Path, bodies: Sequence[Record]) -> dict[str | None, Float64Array]:
     """Return the rigid frames ``world_from_body`` of rigid bodies, without the scale of their prims."""
-    frames: dict[str | None, Float64Array] = {}
-    for body in bodies:
-        frames[body["path"]], _ = rigid_frame(path, body)
-    return frames
+    return {body["path"]: rigid_frame(path, body)[0] for body in bodies}
 
 
 def rigid_frame(path: Path, record: Record) -> tuple[Float64Array, float]:
@@ -99,12 +98,11 @@ def rigid_frame(path: Path, record: Record) -> tuple[Float64Array, float]:
     Raises:
         InputError: If the matrix mirrors, shears or scales non-uniformly.
     """
-    frame = np.eye(4)
     try:
-        frame[:3, :3], scale, frame[:3, 3] = split_similarity(record["matrix"])
+        rotation, scale, translation = split_similarity(record["matrix"])
     except ValueError as error:
         raise InputError(f"{path}: {record['path']}: {error}") from None
-    return frame, scale
+    return homogeneous_matrix(rotation, translation), scale
 
 
 def merge_fields(path: Path, fields: Sequence[Record], frame_from_world: Float64Array) -> tuple[Splats, list[str]]:
@@ -200,11 +198,7 @@ def make_stage_asset(path: Path, records: Record, body: str | None, splats: Spla
             capture_light=values.get("capture_light", "uniform" if kind == "object" else "scene"),
             keypoints={key: tuple(place) for key, place in values.get("keypoints", {}).items()},
             **contact,
-            **{
-                key: values[key]
-                for key in ("rolling_friction", "torsional_friction", "roughness", "specular", "white")
-                if key in values
-            },
+            **{key: values[key] for key in _STATED if key in values},
         ),
     )
     if kind == "object" and dynamics.get("inertia") is not None:
@@ -214,9 +208,8 @@ def make_stage_asset(path: Path, records: Record, body: str | None, splats: Spla
 
 def _checked(path: Path, asset: Asset) -> Asset:
     """Check the values of an asset by the rules of its file."""
-    names = ["name", "class_name", "kind", "mass", "density", "friction", "restitution", "rolling_friction"]
-    names += ["torsional_friction", "roughness", "specular", "capture_light", "white", "keypoints"]
-    values = {name: getattr(asset, name) for name in names} | {"splats": "-", "mesh": "-"}
+    names = ("name", "class_name", "kind", "mass", "density", "friction", "restitution", "capture_light", "keypoints")
+    values = {name: getattr(asset, name) for name in (*names, *_STATED)} | {"splats": "-", "mesh": "-"}
     if asset.mass is not None:
         del values["density"]
     try:

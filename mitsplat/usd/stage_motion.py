@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MAX_TIMES = 10_000
 
 
-def time_codes(stage: Usd.Stage, limit: int | None = None) -> list[float]:
+def time_codes(stage: Usd.Stage, limit: int | None) -> list[float]:
     """Return the time codes of the images; a stage without moving prims and changing visibility has one.
 
     Args:
@@ -58,11 +58,15 @@ def is_moving(prim: Usd.Prim) -> bool:
     """Return True if the pose of a prim in the world may change."""
     from pxr import UsdGeom  # optional
 
+    xforms = (UsdGeom.Xformable(one) for one in lineage(prim) if one.IsA(UsdGeom.Xformable))
+    return any(xform.TransformMightBeTimeVarying() for xform in xforms)
+
+
+def lineage(prim: Usd.Prim) -> Iterator[Usd.Prim]:
+    """Yield a prim and its ancestors, the nearest first."""
     while prim:
-        if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying():
-            return True
+        yield prim
         prim = prim.GetParent()
-    return False
 
 
 def visibility(prim: Usd.Prim, times: Sequence[float]) -> list[bool]:
@@ -72,10 +76,7 @@ def visibility(prim: Usd.Prim, times: Sequence[float]) -> list[bool]:
     def is_visible(time: float) -> bool:
         return bool(UsdGeom.Imageable(prim).ComputeVisibility(time) != UsdGeom.Tokens.invisible)
 
-    ancestor = prim
-    while ancestor and not _is_blinking(ancestor):
-        ancestor = ancestor.GetParent()
-    return [is_visible(time) for time in (times if ancestor else times[:1])]
+    return [is_visible(time) for time in (times if any(map(_is_blinking, lineage(prim))) else times[:1])]
 
 
 def _is_blinking(prim: Usd.Prim) -> bool:

@@ -23,7 +23,7 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.runtime.child_process import run_bounded
 from mitsplat.usd.stage_images import image_settings, unread_settings
-from mitsplat.usd.stage_motion import is_moving, sampled_attributes, time_codes, visibility
+from mitsplat.usd.stage_motion import is_moving, lineage, sampled_attributes, time_codes, visibility
 from mitsplat.usd.stage_physics import Record, body_dynamics, contact_of, mass_of_colliders
 from mitsplat.usd.usd_layers import open_confined, require_usd
 
@@ -139,7 +139,7 @@ class _StageReader:
             if prim.IsA(UsdGeom.PointInstancer):
                 prims.PruneChildren()  # its prototypes are drawn at the points alone
             for name in sampled_attributes(prim):
-                self._ignored[f"sets of time samples of {name}"].append(str(prim.GetPath()))
+                self._ignore(f"sets of time samples of {name}", prim)
             shown = visibility(prim, self._times) if prim.IsA(UsdGeom.Imageable) else [True]
             if prim.HasAPI(UsdPhysics.RigidBodyAPI) and any(shown):
                 found["bodies"].append(self._body(prim))
@@ -147,19 +147,19 @@ class _StageReader:
                 found["cameras"].append(self._camera(prim))
             elif not any(shown) and not prim.HasAPI(UsdPhysics.CollisionAPI):
                 if prim.IsA(UsdGeom.Boundable) or prim.HasAPI(UsdLux.LightAPI):
-                    self._ignored["invisible prims"].append(str(prim.GetPath()))
+                    self._ignore("invisible prims", prim)
             elif prim.IsA(UsdVol.ParticleField):
                 if self._is_gaussian(prim):
                     self._add_field(prim, shown, found)
                 else:
-                    self._ignored["particle fields without Gaussian ellipsoids and SH"].append(str(prim.GetPath()))
+                    self._ignore("particle fields without Gaussian ellipsoids and SH", prim)
             elif prim.IsA(UsdGeom.Gprim):
                 self._gprim(prim, found, is_visible=self._is_visible(prim, shown))
             elif prim.HasAPI(UsdLux.LightAPI):
                 if self._is_visible(prim, shown):
                     found["lights"].append(self._light(prim))
             elif prim.IsA(UsdGeom.Boundable) or prim.IsA(UsdPhysics.Joint):
-                self._ignored[f"prims of type {prim.GetTypeName()}"].append(str(prim.GetPath()))
+                self._ignore(f"prims of type {prim.GetTypeName()}", prim)
         for what, place in unread_settings(self._stage):
             self._ignored[what].append(place)
         self._add_motion([record for records in found.values() for record in records])
@@ -174,10 +174,14 @@ class _StageReader:
         found["default"] = str(self._stage.GetDefaultPrim().GetPath()) if self._stage.GetDefaultPrim() else ""
         return found
 
+    def _ignore(self, what: str, prim: Usd.Prim) -> None:
+        """Record that something of a prim is not read; ``what`` is a noun phrase in the plural."""
+        self._ignored[what].append(str(prim.GetPath()))
+
     def _is_visible(self, prim: Usd.Prim, shown: list[bool]) -> bool:
         """Return the visibility of a prim that is no object: that of the first time code."""
         if any(shown) and not all(shown):
-            self._ignored["changes of the visibility of prims that are no objects"].append(str(prim.GetPath()))
+            self._ignore("changes of the visibility of prims that are no objects", prim)
         return shown[0]
 
     def _add_field(self, prim: Usd.Prim, shown: list[bool], found: Record) -> None:
@@ -219,12 +223,8 @@ class _StageReader:
         """Return the values that records of all kinds have."""
         from pxr import UsdPhysics  # optional
 
-        body = prim
-        while body and not body.HasAPI(UsdPhysics.RigidBodyAPI):
-            body = body.GetParent()
-        owner = prim
-        while owner and METADATA not in owner.GetCustomData():
-            owner = owner.GetParent()
+        body = next((one for one in lineage(prim) if one.HasAPI(UsdPhysics.RigidBodyAPI)), None)
+        owner = next((one for one in lineage(prim) if METADATA in one.GetCustomData()), None)
         return {
             "path": str(prim.GetPath()),
             "matrix": self._world_from(prim),
@@ -258,7 +258,7 @@ class _StageReader:
         """Return the first of the classes of a prim."""
         first, *others = classes
         if others:
-            self._ignored[f"sets of classes besides {first}"].append(str(prim.GetPath()))
+            self._ignore(f"sets of classes besides {first}", prim)
         return first
 
     def _value(self, prim: Usd.Prim, name: str) -> Any:
@@ -274,9 +274,9 @@ class _StageReader:
                 continue
             if len(values) >= count * group:
                 if len(values) > count * group:
-                    self._ignored[f"surplus values of {key}"].append(str(prim.GetPath()))
+                    self._ignore(f"surplus values of {key}", prim)
                 return np.array(values, dtype=np.float32)[: count * group].reshape(count * group, *row)
-            self._ignored[f"values of {key} that are too few"].append(str(prim.GetPath()))
+            self._ignore(f"values of {key} that are too few", prim)
         return np.broadcast_to(np.asarray(default, dtype=np.float32), (count * group, *row)).copy()
 
     @staticmethod
@@ -296,7 +296,7 @@ class _StageReader:
         terms, name = (degree + 1) ** 2, "radiance:sphericalHarmonicsCoefficients"
         sh = self._array(prim, name, count, (0.0, 0.0, 0.0), terms).reshape(count, terms, 3)
         if degree > MAX_DEGREE:
-            self._ignored[f"bands of spherical harmonics above degree {MAX_DEGREE}"].append(str(prim.GetPath()))
+            self._ignore(f"bands of spherical harmonics above degree {MAX_DEGREE}", prim)
             sh = sh[:, : (MAX_DEGREE + 1) ** 2]
         record = self._base(prim) | {
             "means": np.array(positions, dtype=np.float32).reshape(count, 3),
@@ -316,14 +316,11 @@ class _StageReader:
         """Return the colour space that the file states for an attribute, or an empty text."""
         from pxr import Usd  # optional
 
-        for key in (f"{name}", f"{name}h"):
+        for key in (name, f"{name}h"):
             if prim.GetAttribute(key).HasColorSpace():
                 return str(prim.GetAttribute(key).GetColorSpace())
-        while prim:
-            if prim.HasAPI(Usd.ColorSpaceAPI) and (space := Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr().Get()):
-                return str(space)
-            prim = prim.GetParent()
-        return ""
+        spaces = [Usd.ColorSpaceAPI(one) for one in lineage(prim) if one.HasAPI(Usd.ColorSpaceAPI)]
+        return next((str(space) for one in spaces if (space := one.GetColorSpaceNameAttr().Get())), "")
 
     def _body(self, prim: Usd.Prim) -> Record:
         """Return the record of a rigid body; mass, centre and inertia are None where the stage does not state them."""
@@ -333,7 +330,7 @@ class _StageReader:
         if record["mass"] is None and (mass := mass_of_colliders(prim, self._volume)) is not None:
             record["mass"] = mass * self._kilograms
             if sum(one.HasAPI(UsdPhysics.CollisionAPI) for one in Usd.PrimRange(prim)) > 1:
-                self._ignored["distributions of a mass over colliders"].append(str(prim.GetPath()))
+                self._ignore("distributions of a mass over colliders", prim)
         return self._base(prim) | record
 
     def _gprim(self, prim: Usd.Prim, found: Record, *, is_visible: bool) -> None:
@@ -345,7 +342,7 @@ class _StageReader:
 
         triangles = self._triangles(prim)
         if triangles is None:
-            self._ignored[f"prims of type {prim.GetTypeName()}"].append(str(prim.GetPath()))
+            self._ignore(f"prims of type {prim.GetTypeName()}", prim)
             return
         points, faces = triangles
         record = self._base(prim) | {"points": points, "faces": faces, "type": str(prim.GetTypeName())}
@@ -361,7 +358,7 @@ class _StageReader:
                 ("subdivisions", scheme and scheme.HasAuthoredValue() and scheme.Get() != UsdGeom.Tokens.none),
             ):
                 if is_found:
-                    self._ignored[what].append(str(prim.GetPath()))
+                    self._ignore(what, prim)
         if prim.HasAPI(UsdPhysics.CollisionAPI) and UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get():
             approximation = "convexHull"
             if prim.IsA(UsdGeom.Mesh):
@@ -417,7 +414,7 @@ class _StageReader:
         names += ["FocalLength", "FStop", "FocusDistance"]
         values = {name: float(getattr(camera, f"Get{name}Attr")().Get(self._time)) for name in names}
         if camera.GetProjectionAttr().Get(self._time) != UsdGeom.Tokens.perspective:
-            self._ignored["orthographic projections"].append(str(prim.GetPath()))
+            self._ignore("orthographic projections", prim)
         return self._base(prim) | values | image_settings(self._stage, prim, self._time)
 
     def _light(self, prim: Usd.Prim) -> Record:
@@ -432,7 +429,7 @@ class _StageReader:
             inputs[name] = _plain(value)
             is_default = value == prim.GetPrimDefinition().GetAttributeFallbackValue(attribute.GetName())
             if name not in (*_LIGHT_INPUTS, *(_DOME_INPUTS if is_dome else ())) and not is_default:
-                self._ignored[f"values of {attribute.GetName()}"].append(str(prim.GetPath()))
+                self._ignore(f"values of {attribute.GetName()}", prim)
         record = self._base(prim) | {"type": str(prim.GetTypeName()), "inputs": inputs}
         record["point"] = bool(self._value(prim, "treatAsPoint"))
         if is_dome and inputs.get("texture:file"):
@@ -448,13 +445,11 @@ class _StageReader:
         found = self._value(prim, name).resolvedPath
         file = Path(Ar.SplitPackageRelativePathOuter(found)[0])
         if not found or not file.resolve().is_relative_to(self._folder.resolve()):
-            self._ignored["images that are missing or outside of the stage's folder"].append(str(prim.GetPath()))
+            self._ignore("images that are missing or outside of the stage's folder", prim)
             return None
         content = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(found))
         if not content or content.GetSize() > _MAX_IMAGE_SIZE:
-            self._ignored[f"images that cannot be opened or have more than {_MAX_IMAGE_SIZE} bytes"].append(
-                str(prim.GetPath())
-            )
+            self._ignore(f"images that cannot be opened or have more than {_MAX_IMAGE_SIZE} bytes", prim)
             return None
         return np.frombuffer(bytes(content.GetBuffer()), dtype=np.uint8)
 

@@ -143,7 +143,7 @@ class _StageWriter:
             body: Rigid body of an object.
             ground: Collider of an environment.
         """
-        from pxr import Gf, Sdf, Usd, UsdPhysics, UsdSemantics  # optional
+        from pxr import Gf, Usd, UsdPhysics, UsdSemantics  # optional
 
         Usd.ModelAPI(prim).SetKind("component")
         labels = UsdSemantics.LabelsAPI.Apply(prim, "class")
@@ -152,9 +152,7 @@ class _StageWriter:
         path = prim.GetPath()
         _write_field(self.stage, path.AppendChild("splats"), asset.splats)
         if asset.mesh is not None:
-            mesh = self._mesh(path.AppendChild("mesh"), asset.mesh)
-            mesh.CreatePurposeAttr("guide")
-            mesh.GetPrim().CreateAttribute(f"{METADATA}:proxy", Sdf.ValueTypeNames.Bool, custom=True).Set(True)
+            self._proxy(path.AppendChild("mesh"), asset.mesh)
         if body is not None:
             UsdPhysics.RigidBodyAPI.Apply(prim)
             mass = UsdPhysics.MassAPI.Apply(prim)
@@ -171,7 +169,7 @@ class _StageWriter:
 
     def frame(self, content: FrameContent, images: dict[str, Path]) -> None:
         """Write the content of a frame."""
-        from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics  # optional
+        from pxr import Gf, Usd, UsdGeom, UsdPhysics  # optional
 
         world = self.stage.DefinePrim("/World", "Xform")
         self.stage.SetDefaultPrim(world)
@@ -193,9 +191,9 @@ class _StageWriter:
             prim = self.stage.DefinePrim(f"/World/objects/{self.name(asset.name)}_{one.id}", "Xform")
             prim.GetReferences().AddInternalReference(classes[one.asset].GetPath())
             self._place(prim, one.pose)
-            prim.CreateAttribute(f"{METADATA}:instance", Sdf.ValueTypeNames.Int, custom=True).Set(one.id)
+            _set_custom(prim, f"{METADATA}:instance", "Int", one.id)
             if not one.labelled:
-                prim.CreateAttribute(f"{METADATA}:unlabelled", Sdf.ValueTypeNames.Bool, custom=True).Set(True)
+                _set_custom(prim, f"{METADATA}:unlabelled", "Bool", True)
         if content.environment is not None:
             prim = self.stage.DefinePrim("/World/environment", "Xform")
             self.asset(prim, content.environment, None, content.ground)
@@ -207,20 +205,18 @@ class _StageWriter:
 
     def _shapes(self, content: FrameContent) -> None:
         """Write static shapes: a rendered or proxy mesh each, and its colliders."""
-        from pxr import Gf, Sdf, Usd, UsdGeom  # optional
+        from pxr import Gf, Usd, UsdGeom  # optional
 
         if content.shapes:
             Usd.ModelAPI(UsdGeom.Scope.Define(self.stage, "/World/shapes")).SetKind("group")
         for number, shape in enumerate(content.shapes):
             prim = self.stage.DefinePrim(f"/World/shapes/{self.name(shape.name)}_{number}", "Xform")
             Usd.ModelAPI(prim).SetKind("component")
-            if shape.colour is not None or shape.proxy:
-                mesh = self._mesh(prim.GetPath().AppendChild("mesh"), shape.mesh)
-                if shape.colour is None:
-                    mesh.CreatePurposeAttr("guide")
-                    mesh.GetPrim().CreateAttribute(f"{METADATA}:proxy", Sdf.ValueTypeNames.Bool, custom=True).Set(True)
-                else:
-                    mesh.CreateDisplayColorAttr([Gf.Vec3f(*shape.colour)])
+            path = prim.GetPath().AppendChild("mesh")
+            if shape.colour is not None:
+                self._mesh(path, shape.mesh).CreateDisplayColorAttr([Gf.Vec3f(*shape.colour)])
+            elif shape.proxy:
+                self._proxy(path, shape.mesh)
             collider = shape.collider
             if collider is None:
                 continue
@@ -262,6 +258,12 @@ class _StageWriter:
         prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
         return prim
 
+    def _proxy(self, path: Sdf.Path, mesh: trimesh.Trimesh) -> None:
+        """Write a mesh that is not rendered, against which rays of light are traced."""
+        prim = self._mesh(path, mesh)
+        prim.CreatePurposeAttr("guide")
+        _set_custom(prim.GetPrim(), f"{METADATA}:proxy", "Bool", True)
+
     def _pieces(
         self, path: Sdf.Path, pieces: Iterable[trimesh.Trimesh], material: ContactMaterial, size: float
     ) -> None:
@@ -280,7 +282,7 @@ class _StageWriter:
 
     def _contact(self, path: Sdf.Path, material: ContactMaterial, size: float) -> UsdShade.Material:
         """Write a contact material; Newton reads the attributes of its namespace."""
-        from pxr import Sdf, UsdPhysics, UsdShade  # optional
+        from pxr import UsdPhysics, UsdShade  # optional
 
         prim = UsdShade.Material.Define(self.stage, path.AppendChild("contact")).GetPrim()
         api = UsdPhysics.MaterialAPI.Apply(prim)
@@ -294,21 +296,21 @@ class _StageWriter:
             ("contactStiffness", config.ke),
             ("contactDamping", config.kd),
         ):
-            prim.CreateAttribute(f"newton:{name}", Sdf.ValueTypeNames.Float, custom=True).Set(value)
+            _set_custom(prim, f"newton:{name}", "Float", value)
         return UsdShade.Material(prim)
 
     @staticmethod
     def _collide(prim: Usd.Prim, material: UsdShade.Material) -> None:
         """Make a prim a collider with a contact material; Newton gives its MuJoCo solver the attributes ``mjc``."""
-        from pxr import Sdf, UsdPhysics, UsdShade, Vt  # optional
+        from pxr import UsdPhysics, UsdShade, Vt  # optional
 
         UsdPhysics.CollisionAPI.Apply(prim)
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material, materialPurpose="physics")
-        prim.CreateAttribute("mjc:condim", Sdf.ValueTypeNames.Int, custom=True).Set(WITH_ROLL)
+        _set_custom(prim, "mjc:condim", "Int", WITH_ROLL)
         for name in ("contactMargin", "contactGap"):  # the gap of Newton's default moves objects at rest
-            prim.CreateAttribute(f"newton:{name}", Sdf.ValueTypeNames.Float, custom=True).Set(0.0)
+            _set_custom(prim, f"newton:{name}", "Float", 0.0)
         impedance = Vt.DoubleArray(IMPEDANCE_MUJOCO)
-        prim.CreateAttribute("mjc:solimp", Sdf.ValueTypeNames.DoubleArray, custom=True).Set(impedance)
+        _set_custom(prim, "mjc:solimp", "DoubleArray", impedance)
 
     def _camera(self, camera: Camera) -> None:
         """Write a camera, and render settings with the size of its image. Lengths are in tenths of a metre."""
@@ -381,6 +383,13 @@ class _StageWriter:
         self._place(made.GetPrim(), pose)
 
 
+def _set_custom(prim: Usd.Prim, name: str, kind: str, value: object) -> None:
+    """Write an attribute that no schema has, of a type of ``Sdf.ValueTypeNames``."""
+    from pxr import Sdf  # optional
+
+    prim.CreateAttribute(name, getattr(Sdf.ValueTypeNames, kind), custom=True).Set(value)
+
+
 def _metadata(asset: Asset) -> JsonObject:
     """Return the values of an asset that no schema of USD has."""
     from pxr import Gf  # optional
@@ -396,7 +405,7 @@ def _metadata(asset: Asset) -> JsonObject:
 
 def _write_field(stage: Usd.Stage, path: Sdf.Path, splats: Splats) -> None:
     """Write splats as a particle field, in single precision; materials are attributes of our own."""
-    from pxr import Gf, Sdf, Usd, UsdVol, Vt  # optional
+    from pxr import Gf, Usd, UsdVol, Vt  # optional
 
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
     prim = field.GetPrim()
@@ -414,8 +423,7 @@ def _write_field(stage: Usd.Stage, path: Sdf.Path, splats: Splats) -> None:
         field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(bounds.astype(np.float32)))
     materials = splats.materials
     for name in () if materials is None else ("metallic", "roughness", "specular"):
-        attribute = prim.CreateAttribute(f"{METADATA}:{name}", Sdf.ValueTypeNames.FloatArray, custom=True)
-        attribute.Set(Vt.FloatArray.FromNumpy(getattr(materials, name)))
+        values = Vt.FloatArray.FromNumpy(getattr(materials, name))
+        _set_custom(prim, f"{METADATA}:{name}", "FloatArray", values)
     if materials is not None and materials.normals is not None:
-        attribute = prim.CreateAttribute(f"{METADATA}:normals", Sdf.ValueTypeNames.Normal3fArray, custom=True)
-        attribute.Set(Vt.Vec3fArray.FromNumpy(materials.normals))
+        _set_custom(prim, f"{METADATA}:normals", "Normal3fArray", Vt.Vec3fArray.FromNumpy(materials.normals))

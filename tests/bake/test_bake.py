@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 import mitsplat
 from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.mesh_parts import UNIFORM_LIGHT, bake_lights, mitsuba_scene, read_parts
+from mitsplat.bake.mesh_parts import read_parts
+from mitsplat.bake.part_shapes import UNIFORM_LIGHT, bake_lights, mitsuba_scene
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import evaluate_sh
 from mitsplat.gaussians.splat_cloud import Splats

@@ -23,12 +23,13 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
 from mitsplat.runtime.child_process import run_bounded
 from mitsplat.usd.stage_images import image_settings, unread_settings
+from mitsplat.usd.stage_meshes import triangles_of
 from mitsplat.usd.stage_motion import is_moving, lineage, sampled_attributes, time_codes, visibility
 from mitsplat.usd.stage_physics import Record, body_dynamics, contact_of, mass_of_colliders
 from mitsplat.usd.usd_layers import open_confined, require_usd
 
 if TYPE_CHECKING:
-    from pxr import Usd, UsdGeom
+    from pxr import Usd
 
 METADATA = "mitsplat"
 """Key of ``customData``, and namespace of attributes, for values that no schema of USD has."""
@@ -45,7 +46,6 @@ _LIGHT_INPUTS = (
 )
 """Inputs of lights that are read; those of dome lights are others."""
 _DOME_INPUTS = ("texture:file", "texture:format")
-_ROUND_SEGMENTS = 64
 
 
 def read_records(path: Path, images: int | None = 1) -> Record:
@@ -340,7 +340,7 @@ class _StageReader:
         """
         from pxr import UsdGeom, UsdPhysics, UsdShade  # optional
 
-        triangles = self._triangles(prim)
+        triangles = triangles_of(prim, self._time)
         if triangles is None:
             self._ignore(f"prims of type {prim.GetTypeName()}", prim)
             return
@@ -371,39 +371,13 @@ class _StageReader:
         """Return the volume of a collider in units of the stage: that of its mesh, or else of its convex hull."""
         import trimesh  # the child alone needs it
 
-        triangles = self._triangles(prim)
+        triangles = triangles_of(prim, self._time)
         if triangles is None:
             return 0.0
         mesh = trimesh.Trimesh(*triangles).apply_transform(self._world_from(prim))
         if self._value(prim, "physics:approximation") == "convexHull" or not mesh.is_watertight:
             mesh = mesh.convex_hull
         return float(abs(mesh.volume) / self._units**3)
-
-    def _triangles(self, prim: Usd.Prim) -> tuple[Float64Array, npt.NDArray[np.int64]] | None:
-        """Return vertices and triangles of a prim in its own coordinates; None for an unsupported type."""
-        import trimesh  # the child alone needs it
-        from pxr import UsdGeom  # optional
-
-        solids = trimesh.creation
-        if prim.IsA(UsdGeom.Mesh):
-            return _mesh_triangles(UsdGeom.Mesh(prim), self._time)
-        if prim.IsA(UsdGeom.Cube):
-            mesh = solids.box([UsdGeom.Cube(prim).GetSizeAttr().Get(self._time)] * 3)
-        elif prim.IsA(UsdGeom.Sphere):
-            mesh = solids.icosphere(3, UsdGeom.Sphere(prim).GetRadiusAttr().Get(self._time))
-        elif prim.IsA(UsdGeom.Cylinder) or prim.IsA(UsdGeom.Capsule) or prim.IsA(UsdGeom.Cone):
-            height, radius = self._value(prim, "height"), self._value(prim, "radius")
-            if prim.IsA(UsdGeom.Cylinder):
-                mesh = solids.cylinder(radius, height, sections=_ROUND_SEGMENTS)
-            elif prim.IsA(UsdGeom.Capsule):
-                mesh = solids.capsule(height, radius)
-            else:
-                mesh = solids.cone(radius, height, sections=_ROUND_SEGMENTS)
-            mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
-            mesh.vertices = np.roll(mesh.vertices, {"X": 1, "Y": 2, "Z": 0}[self._value(prim, "axis")], axis=1)
-        else:
-            return None
-        return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
 
     def _camera(self, prim: Usd.Prim) -> Record:
         """Return the record of a camera: GfCamera, apertures and focal length in tenths of a unit."""
@@ -452,39 +426,6 @@ class _StageReader:
             self._ignore(f"images that cannot be opened or have more than {_MAX_IMAGE_SIZE} bytes", prim)
             return None
         return np.frombuffer(bytes(content.GetBuffer()), dtype=np.uint8)
-
-
-def _mesh_triangles(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> tuple[Float64Array, npt.NDArray[np.int64]] | None:
-    """Return vertices and triangles of a polygon mesh; polygons are split into fans."""
-    points, counts, corners = (
-        np.array(attribute.Get(time) if attribute.Get(time) is not None else ())
-        for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
-    )
-    path = mesh.GetPrim().GetPath()
-    if not len(counts):
-        return None
-    if counts.min() < 3 or counts.sum() != len(corners):
-        raise InputError(
-            f"{path}: faceVertexCounts must be at least 3 and have the sum {len(corners)}, the number of "
-            f"faceVertexIndices (got a least count of {counts.min()} and the sum {counts.sum()})"
-        )
-    if corners.min() < 0 or corners.max() >= len(points):
-        raise InputError(
-            f"{path}: faceVertexIndices must be 0 to {len(points) - 1} (got {corners.min()} to {corners.max()})"
-        )
-    faces = np.concatenate(list(_fans(counts.astype(np.int64), corners.astype(np.int64))))
-    if mesh.GetOrientationAttr().Get() == "leftHanded":
-        faces = faces[:, ::-1]
-    return points.astype(np.float64), np.ascontiguousarray(faces)
-
-
-def _fans(counts: npt.NDArray[np.int64], corners: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.int64]]:
-    """Yield the triangles (N, 3) of all polygons with equal numbers of corners."""
-    starts = np.cumsum(counts) - counts
-    for size in np.unique(counts):
-        first = starts[counts == size]
-        for corner in range(1, size - 1):
-            yield corners[np.stack([first, first + corner, first + corner + 1], axis=1)]
 
 
 def _plain(value: Any) -> Any:

@@ -17,7 +17,8 @@ from mitsplat.arrays import Float64Array
 from mitsplat.asset import ASSET_FILE, Asset, opaque_core
 from mitsplat.checks.exposure_check import check_exposure
 from mitsplat.checks.lamp_check import check_lamps
-from mitsplat.dataset.preflight import run_faults, scene_warnings
+from mitsplat.checks.scene_warnings import scene_warnings
+from mitsplat.dataset.preflight import run_faults
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.formats.registry import Catalogue

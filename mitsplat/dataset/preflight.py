@@ -1,8 +1,9 @@
 """Preflight checks: reasons why a run would produce no labels or exceed this machine.
 
 Each function yields the faults that it finds, as :class:`mitsplat.findings.Finding`. ``mitsplat check`` prints all of
-them; other commands refuse the scene for the first one (:func:`refuse`). Only certain failures are faults. All bounds
-are generous, because a scene that is refused by mistake cannot be rendered at all.
+them; other commands refuse the scene for the first one (:func:`refuse`). Only certain failures are faults, and
+:mod:`mitsplat.checks.scene_warnings` finds probable mistakes. All bounds are generous, because a scene that is refused
+by mistake cannot be rendered at all.
 """
 
 from __future__ import annotations
@@ -19,20 +20,16 @@ from mitsplat.dataset.dataset_files import MANIFEST
 from mitsplat.engine.resources import unused_memory
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.findings import Finding
-from mitsplat.frames.budget import worker_memory
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh import check_size
 from mitsplat.geometry.mesh_points import points_inside
 from mitsplat.scene.planning.frame_plan import FramePlan, plan_frame
-from mitsplat.scene.planning.lens_warnings import lens_warnings
-from mitsplat.scene.planning.unit_warnings import unit_warnings
 from mitsplat.scene.planning.view_diagnosis import FAR, distance_to_box, pose_cause, sees
 from mitsplat.scene.planning.visibility_prediction import enclosing_shape
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec.light_spec import LocalLight
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
-from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, backdrop_walls, enclosed_bounds, pose_matrix, walls_beside
+from mitsplat.scene.walls import ENCLOSURE, PILE_HEIGHT, enclosed_bounds, walls_beside
 
 MAX_FRAMES = 2**31 - 1
 MAX_TIME = 2000.0
@@ -47,16 +44,13 @@ MIN_PIXEL_BYTES, MIN_PROCESS_GIB = 500, 0.5
 Measured with the workcell scene: 1.0 GiB at 640x360, 2.6 GiB at 2000x2000, 8.4 GiB at 4000x4000. Other scenes need
 more, up to the estimate of :func:`mitsplat.frames.budget.worker_memory`.
 """
-MIN_SHARE_IN_BIN = 0.5
-"""Share of the region above a bin below which objects probably fall beside it by mistake."""
-SLOW_OBJECTS = 40
-"""Number of objects per layout above which settling takes minutes on two cores; 25 took 27 s, 50 took 212 s."""
 MIN_FRAME_BYTES = 8192
 """Minimum disk space of a frame [bytes]: one block for the image, one for the label."""
 _MAX_CELLS = 24  # per axis of a region, in the search for free volume
 
 
-def _fault(name: str, text: str, remedy: str) -> Finding:
+def fault(name: str, text: str, remedy: str) -> Finding:
+    """Return a finding that is a problem."""
     return Finding(name, False, text, remedy)
 
 
@@ -67,9 +61,9 @@ def refuse(scene: Scene, faults: Iterable[Finding]) -> None:
         InputError: If there is a fault.
         MissingResourceError: If the first fault is a lack of memory or disk space.
     """
-    for fault in faults:
-        kind = MissingResourceError if fault.name in ("memory", "disk") else InputError
-        raise kind(f"{scene.path}: {fault.text}; {fault.remedy}")
+    for found in faults:
+        kind = MissingResourceError if found.name in ("memory", "disk") else InputError
+        raise kind(f"{scene.path}: {found.text}; {found.remedy}")
 
 
 def run_faults(
@@ -102,7 +96,7 @@ def count_faults(scene: Scene) -> Iterator[Finding]:
     """Check that the number of images does not exceed the range of their indices."""
     if scene.num_frames > MAX_FRAMES:
         text = f"output: layouts x views must be at most {MAX_FRAMES} images (got {scene.num_frames})"
-        yield _fault("frames", text, "lower output.layouts or output.views")
+        yield fault("frames", text, "lower output.layouts or output.views")
 
 
 def layout_faults(scene: Scene) -> Iterator[Finding]:
@@ -110,7 +104,7 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
     settle = scene.spec.settle
     if settle.max_time > MAX_TIME:
         text = f"settle: max_time must be at most {MAX_TIME:g} s (got {settle.max_time:g} s)"
-        yield _fault("time", text, "lower settle.max_time")
+        yield fault("time", text, "lower settle.max_time")
     dropped = [i for i, entry in enumerate(scene.spec.objects) if not entry.poses]
     if not dropped:
         return
@@ -120,7 +114,7 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
                 check_size(mesh, f"shapes[{number}]")
             except InputError as error:
                 wrong = "the mesh" if shape.mesh else "its size, in metres"
-                yield _fault("shape", str(error), f"correct {wrong}, or set collider: false")
+                yield fault("shape", str(error), f"correct {wrong}, or set collider: false")
                 return
     for number, (region, arrangements) in enumerate(scene.spec.all_regions):
         where = f"regions[{number - 1}]" if number else "region"
@@ -139,7 +133,7 @@ def _region_faults(
         (box[0, :2] < high[:2]).all() and (box[1, :2] > low[:2]).all() and box[0, 2] < high[2] for box in supports
     ):
         text = f"{where}: no collider is below it, so all objects fall forever"
-        yield _fault("support", text, "move region above the table, or the table below it")
+        yield fault("support", text, "move region above the table, or the table below it")
         return
     if "pile" in arrangements:
         high[2] += PILE_HEIGHT
@@ -165,7 +159,7 @@ def _room_faults(
         taken |= inside
     if taken.all():
         text = f"{where}: lies inside of colliders, {' and '.join(in_way)}"
-        yield _fault("region", text, "move region above it")
+        yield fault("region", text, "move region above it")
         return
     volume = float(np.prod(high - low)) * float((~taken).mean())
     hulls = {id(mesh): float(mesh.convex_hull.volume) for mesh in meshes}
@@ -174,7 +168,7 @@ def _room_faults(
     if need > volume:
         objects = f"{sum(numbers)} objects of {1e3 * need:.3g} l"
         text = f"{where}: at most {objects} start in it at once (its free volume is {1e3 * volume:.3g} l)"
-        yield _fault("room", text, "lower objects[].count or make region larger")
+        yield fault("room", text, "lower objects[].count or make region larger")
 
 
 def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
@@ -184,10 +178,10 @@ def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
     size = f"an image of {output.width}x{output.height} px"
     if need > free:
         text = f"output: {size} takes at least {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
-        yield _fault("memory", text, "lower output.width and height")
+        yield fault("memory", text, "lower output.width and height")
     elif workers is not None and workers * need > free:
         text = f"workers: {workers} that each render {size} take at least {workers * need:.0f} GiB of memory"
-        yield _fault("memory", f"{text} ({free:.1f} GiB are unused)", "use fewer workers")
+        yield fault("memory", f"{text} ({free:.1f} GiB are unused)", "use fewer workers")
 
 
 def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
@@ -203,7 +197,7 @@ def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:
     if need > free:
         sizes = f"{_format_bytes(need)} ({_format_bytes(free)} are free at {folder})"
         text = f"output: {frames} images take at least {sizes}"
-        yield _fault("disk", text, "lower output.layouts or views, give --frames, or write to another disk")
+        yield fault("disk", text, "lower output.layouts or views, give --frames, or write to another disk")
 
 
 def _format_bytes(size: int) -> str:
@@ -224,15 +218,15 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
     pixels = spec.output.width * spec.output.height
     if pixels < least:
         text = f"output: an image of {pixels} px cannot show labels.min_pixels = {least}"
-        yield _fault("labels", text, "make output.width and height larger")
+        yield fault("labels", text, "make output.width and height larger")
         return
-    cameras = [plan.camera for plan in _plans(scene, frames)]
+    cameras = [plan.camera for plan in sampled_plans(scene, frames)]
     hidden = [name for camera in cameras if (name := enclosing_shape(scene, camera.centre))]
     if len(hidden) == len(cameras):
         text = f"camera: every view is from inside of shape {hidden[0]!r}, which hides all objects"
-        yield _fault("visibility", text, "move camera out of it")
+        yield fault("visibility", text, "move camera out of it")
         return
-    low, high = _reachable_box(scene)
+    low, high = reachable_box(scene)
     nearest = min(cameras, key=lambda camera: distance_to_box(camera.centre, low, high))
     away = distance_to_box(nearest.centre, low, high)
     if not any(sees(camera, low, high) for camera in cameras):
@@ -241,7 +235,7 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
             f"place is {away:.3g} m from the camera)"
         )
         remedy = pose_cause(nearest, low, high) or "turn camera to region: `mitsplat preview` shows where it looks"
-        yield _fault("visibility", text, remedy)
+        yield fault("visibility", text, remedy)
         return
     depths = [_depth_range(camera, low, high) for camera in cameras]
     across = [far * c.width / c.fx for c, (_, far) in zip(cameras, depths, strict=True)]
@@ -249,7 +243,7 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
     if max(across) < MIN_VIEW_WIDTH * smallest:
         view = f"{max(across):.2g} m (the smallest object is {smallest:.2g} m long)"
         text = f"camera.intrinsics: an image shows at most {view}"
-        yield _fault("lens", text, "fx and fy are focal lengths in pixels")
+        yield fault("lens", text, "fx and fy are focal lengths in pixels")
     largest = max(float(np.linalg.norm(mesh.extents)) for mesh in meshes)
     shown = max(_max_pixels(c, largest, near) for c, (near, _) in zip(cameras, depths, strict=True))
     if shown < least:
@@ -258,135 +252,10 @@ def label_faults(scene: Scene, frames: Sequence[int]) -> Iterator[Finding]:
         if away > FAR:
             text += f"; the nearest place of objects is {away:.3g} m away"
             remedy = "is its position in millimetres? Otherwise move camera nearer, or make fx larger"
-        yield _fault("labels", text, remedy)
+        yield fault("labels", text, remedy)
 
 
-def scene_warnings(scene: Scene) -> Iterator[Finding]:
-    """Find probable mistakes that do not stop a run.
-
-    Examples are views or lights inside of solids, bins that are too small, and high cost in memory or time.
-    """
-    spec = scene.spec
-    plans = _plans(scene, range(min(scene.num_frames, MAX_FRAMES)))
-    cameras = [plan.camera for plan in plans]
-    inside = [name for camera in cameras if (name := enclosing_shape(scene, camera.centre))]
-    low, high = _reachable_box(scene)
-    blind = [camera for camera in cameras if not sees(camera, low, high)]
-    remedy = "move camera, its keys or its ranges: such images have no labels"
-    if blind and distance_to_box(blind[0].centre, low, high) > FAR:
-        remedy += "; is a position in millimetres?"
-    yield Finding(
-        "views",
-        not inside and not blind,
-        f"of {len(cameras)} views, {len(inside)} lie inside a shape and {len(blind)} show no place where objects can "
-        "be",
-        remedy,
-    )
-    if spec.output.views > 1 and spec.background is None and _is_repeated(scene, plans[0]):
-        text = "output.views: the images of a layout show the same view in the same light, and differ in noise alone"
-        yield _fault("views", text, "set it to 1 with more layouts, or state camera.jitter or randomise")
-    yield from lens_warnings(spec)
-    yield from unit_warnings(spec)
-    yield from _cost_warnings(scene)
-    yield from _backdrop_warnings(scene, plans)
-    for number, light in enumerate(spec.lights):
-        if (
-            isinstance(light, LocalLight)
-            and not light.has_drawn_position
-            and (name := enclosing_shape(scene, np.array(light.position)))
-        ):
-            text = f"lights[{number}] is inside of shape {name!r}"
-            yield _fault("lights", text, "move it out: it lights nothing")
-    if any(isinstance(light, LocalLight) and light.has_drawn_position for light in spec.lights):
-        lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
-        names = [name for light in lights if (name := enclosing_shape(scene, np.array(light.position)))]
-        if names:
-            text = f"{len(names)} of {len(lights)} drawn lights lie inside a shape, such as {names[0]!r}"
-            yield _fault("lights", text, "narrow lights[].draw: they light nothing")
-    yield from _bin_warnings(scene)
-
-
-def _is_repeated(scene: Scene, one: FramePlan) -> bool:
-    """Return True if the second image has the view, the light and the random values of the first one."""
-    other = plan_frame(scene, 1)
-    values = [{**plan.draws, "motion_angle": 0.0} for plan in (one, other)]
-    same_view = np.array_equal(one.camera.world_from_camera, other.camera.world_from_camera)
-    return same_view and one.lights == other.lights and one.belt == other.belt and values[0] == values[1]
-
-
-def _bin_warnings(scene: Scene) -> Iterator[Finding]:
-    """Warn of bins that are too small for an object, and of bins beside which objects fall."""
-    regions = scene.spec.all_regions
-    for number, shape in enumerate(scene.spec.shapes):
-        if shape.bin is None:
-            continue
-        opening = np.sort(shape.bin.size[:2])
-        too_large = [
-            asset.name
-            for asset in {asset.name: asset for asset in scene.assets}.values()
-            if asset.mesh is not None and (np.sort(asset.mesh.extents)[:2] > opening).any()
-        ]
-        for name in too_large:
-            text = f"shapes[{number}]: {name!r} does not fit into {shape.name!r}"
-            yield _fault("bin", text, "make the bin larger, or the object smaller by scale")
-        # Beside a bin that some layouts lack, objects are meant to fall.
-        if too_large or not shape.collider or shape.share < 1 or all(entry.poses for entry in scene.spec.objects):
-            continue
-        centre, half = np.array(shape.bin.position[:2]), np.array(shape.bin.size[:2]) / 2
-        shares = []
-        for region, _ in regions:
-            low, high = np.array(region.min[:2]), np.array(region.max[:2])
-            common = np.minimum(high, centre + half) - np.maximum(low, centre - half)
-            share = float(np.prod(np.maximum(common, 0)) / np.prod(high - low))
-            shares.append(share if region.max[2] > shape.bin.position[2] else 0.0)
-        where = "the region is" if len(regions) == 1 else "all regions are"
-        if max(shares) == 0:
-            text = f"shapes[{number}]: {where} beside the bin {shape.name!r}, so no object falls into it"
-            yield _fault("bin", text, "move region above it, or the bin below it (metres?)")
-        elif len(regions) == 1 and shares[0] < MIN_SHARE_IN_BIN:
-            text = f"region: only {shares[0]:.0%} of it is above the bin {shape.name!r}"
-            yield _fault("bin", text, "make region smaller than the bin, or objects fall beside it")
-
-
-def _cost_warnings(scene: Scene) -> Iterator[Finding]:
-    """Warn of frames that may exceed the memory, and of layouts that take minutes to settle."""
-    output, free = scene.spec.output, unused_memory()
-    need = worker_memory(scene).own / 2**30
-    if need > free:
-        size = f"{output.width}x{output.height} px"
-        text = f"an image of {size} may take {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
-        yield _fault("memory", text, "lower output.width and height: it may be refused after the first layout")
-    most = sum(entry.max_count for entry in scene.spec.objects if not entry.poses)
-    if most > SLOW_OBJECTS:
-        text = f"a layout of up to {most} objects takes minutes to settle"
-        yield _fault("settling", text, "lower objects[].count, or add views to each layout by output.views")
-
-
-def _backdrop_warnings(scene: Scene, plans: Sequence[FramePlan]) -> Iterator[Finding]:
-    """Warn of views and lights behind a wall of the backdrop."""
-    walls = backdrop_walls(scene.spec)
-    middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
-
-    def behind(point: Iterable[float]) -> bool:
-        """Return True if the middle plane of a wall separates a point from the centre of the region."""
-        for box in walls:
-            axis = int(np.argmin(box.size))
-            turn = pose_matrix(box)[:3, :3].T
-            here, there = (turn @ np.subtract(tuple(place), box.position) for place in (point, middle))
-            if here[axis] * there[axis] < 0:
-                return True
-        return False
-
-    if hidden := sum(behind(plan.camera.centre) for plan in plans):
-        text = f"of {len(plans)} views {hidden} are from behind a wall of the backdrop, which hides everything"
-        yield _fault("backdrop", text, "make backdrop.size larger")
-    lights = {light for plan in plans for light in plan.lights if isinstance(light, LocalLight)}
-    if hidden := sum(behind(light.position) for light in lights):
-        text = f"{hidden} of {len(lights)} lights are behind a wall of the backdrop"
-        yield _fault("backdrop", text, "move lights into the room")
-
-
-def _plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:
+def sampled_plans(scene: Scene, frames: Sequence[int]) -> list[FramePlan]:
     """Plan up to :data:`VIEWS` of the frames, evenly spread."""
     return [plan_frame(scene, frames[position]) for position in evenly_spaced(len(frames), VIEWS)]
 
@@ -399,7 +268,7 @@ def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:
         yield from ((around.name, around.mesh) for around in scene.environments if around.mesh is not None)
 
 
-def _reachable_box(scene: Scene) -> tuple[Float64Array, Float64Array]:
+def reachable_box(scene: Scene) -> tuple[Float64Array, Float64Array]:
     """Return the corners of a box [m] that contains every point that objects can reach.
 
     An object that leaves the box causes its layout to be drawn again.

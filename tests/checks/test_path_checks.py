@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 
 from mitsplat.asset import Asset
 from mitsplat.checks.path_checks import _SCENE_KEYS, SIZE_LIMITS, _located, _mass, check_asset, check_scene
-from mitsplat.dataset.preflight import scene_warnings
+from mitsplat.checks.scene_warnings import scene_warnings
 from mitsplat.findings import Finding
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.scene.loading.scene_loading import load_scene

@@ -9,10 +9,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from mitsplat.checks import scene_warnings as warnings_module
 from mitsplat.checks.path_checks import check_scene
+from mitsplat.checks.scene_warnings import scene_warnings
 from mitsplat.dataset import preflight as prospects
 from mitsplat.dataset import write as dataset
-from mitsplat.dataset.preflight import disk_faults, image_faults, refuse, run_faults, scene_warnings, sees
+from mitsplat.dataset.preflight import disk_faults, image_faults, refuse, run_faults, sees
 from mitsplat.dataset.write import write_dataset
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames.accuracy import speed_accuracy as chart
@@ -58,7 +60,8 @@ HOPELESS = {
 @pytest.fixture
 def machine(monkeypatch):
     """Mock a machine with 8 GiB of memory and 10 GiB of free disk space."""
-    monkeypatch.setattr(prospects, "unused_memory", lambda: 8.0)
+    for module in (prospects, warnings_module):
+        monkeypatch.setattr(module, "unused_memory", lambda: 8.0)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(2**40, 0, 10 * 2**30))
 
 
@@ -169,7 +172,7 @@ def test_a_region_outside_of_the_bin_is_reported(position, region, text, scene_d
 def test_check_warns_of_slow_settling_and_of_large_images(scene_data, write_scene, monkeypatch):
     scene_data["objects"][0]["count"] = [100, 200]
     scene_data["output"] |= {"width": 3000, "height": 3000}
-    monkeypatch.setattr(prospects, "unused_memory", lambda: 5.0)
+    monkeypatch.setattr(warnings_module, "unused_memory", lambda: 5.0)
     found = {
         finding.name: finding.text for finding in scene_warnings(load_scene(write_scene(scene_data))) if not finding.ok
     }
@@ -186,7 +189,10 @@ def test_an_image_larger_than_the_memory_is_refused_before_rendering(scene_data,
 
 def test_the_cost_of_checks_does_not_grow_with_layouts(scene_data, write_scene, monkeypatch):
     planned = []
-    monkeypatch.setattr(prospects, "plan_frame", lambda scene, index: planned.append(index) or plan_frame(scene, index))
+    for module in (prospects, warnings_module):
+        monkeypatch.setattr(
+            module, "plan_frame", lambda scene, index: planned.append(index) or plan_frame(scene, index)
+        )
     scene_data["output"]["layouts"] = 100_000
     scene = load_scene(write_scene(scene_data))
     assert list(run_faults(scene)) == []

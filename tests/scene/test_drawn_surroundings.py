@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mitsplat.dataset.preflight import scene_warnings
+from mitsplat.checks.scene_warnings import scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.frames.light_properties import light_properties
 from mitsplat.scene.loading.scene_loading import load_scene

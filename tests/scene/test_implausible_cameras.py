@@ -12,7 +12,8 @@ import pytest
 import mitsplat as ms
 from mitsplat.checks.exposure_check import check_exposure
 from mitsplat.checks.path_checks import _check_view
-from mitsplat.dataset.preflight import label_faults, scene_warnings
+from mitsplat.checks.scene_warnings import scene_warnings
+from mitsplat.dataset.preflight import label_faults
 from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.scene.planning.lens_warnings import lens_warnings
 from tests.conftest import WriteScene

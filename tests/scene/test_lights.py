@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from mitsplat.checks.scene_warnings import scene_warnings
 from mitsplat.dataset.inputs import describe_inputs
-from mitsplat.dataset.preflight import scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame

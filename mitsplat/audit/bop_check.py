@@ -26,13 +26,14 @@ from mitsplat.audit.dataset_check import (
     compare_keys,
     is_close,
     prefixed,
+    read_json_file,
 )
 from mitsplat.audit.decoded_frame import DecodedFrame, DecodedInstance, bounds_of
 from mitsplat.audit.expected_files import labelled_assets
 from mitsplat.errors import InputError
 from mitsplat.images.masks import Box
 from mitsplat.images.picture_files import read_picture
-from mitsplat.storage.files import JsonObject, read_json
+from mitsplat.storage.files import JsonObject
 from mitsplat.storage.json_stream import read_entries
 
 _PARTS = ("camera", "gt", "gt_info")
@@ -139,32 +140,20 @@ class BopCheck(DatasetCheck):
         (fx, _, cx), (_, fy, cy), _ = frame.intrinsics
         expected = {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5, "depth_scale": frame.record["depth_scale"]}
         expected |= dict(zip(("width", "height"), frame.size, strict=True))
-        try:
-            found: object = read_json(self._root / file)
-        except FileNotFoundError:
-            yield file, "is missing"
-            return
-        except (OSError, ValueError) as error:
-            yield file, f"cannot be read ({error})"
-            return
-        for key, value in expected.items():
-            if not isinstance(found, dict) or not is_close(found.get(key), value):
-                yield file, f"{key} is not that of the first frame, {value:g}"
-                return
+        for found in (yield from read_json_file(self._root, file)):
+            for key, value in expected.items():
+                if not isinstance(found, dict) or not is_close(found.get(key), value):
+                    yield file, f"{key} is not that of the first frame, {value:g}"
+                    return
 
     def _check_models(self) -> Violations:
         """Check that the model files exist and have the stated measures."""
         file = "bop/models/models_info.json"
-        info: object = None
-        try:
-            info = read_json(self._root / file)
-        except FileNotFoundError:
-            yield file, "is missing"
-        except (OSError, ValueError) as error:
-            yield file, f"cannot be read ({error})"
+        found = yield from read_json_file(self._root, file)
+        info = found[0] if found and isinstance(found[0], dict) else {}
         labelled = labelled_assets(self._content)
         numbers = {str(position + 1) for position in labelled}
-        if isinstance(info, dict) and info.keys() - numbers:
+        if info.keys() - numbers:
             yield file, f"has an entry {min(info.keys() - numbers)}, which is no labelled object"
         for number in (position + 1 for position in labelled):
             model = f"bop/models/obj_{number:06d}.ply"
@@ -181,8 +170,8 @@ class BopCheck(DatasetCheck):
             measured = {"diameter": float(pdist(self._corners[number]).max())}
             measured |= {f"min_{axis}": value for axis, value in zip("xyz", low, strict=True)}
             measured |= {f"size_{axis}": value for axis, value in zip("xyz", high - low, strict=True)}
-            stated = info.get(str(number), {}) if isinstance(info, dict) else {}
-            if info is not None and not all(
+            stated = info.get(str(number), {})
+            if found and not all(
                 isinstance(stated, dict) and is_close(stated.get(key), value, _MODEL_TOLERANCE / max(1.0, abs(value)))
                 for key, value in measured.items()
             ):

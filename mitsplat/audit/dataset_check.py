@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.audit.decoded_frame import DecodedFrame
-from mitsplat.storage.files import JsonObject
+from mitsplat.storage.files import JsonObject, read_json
 
 Entry = TypeVar("Entry")
 Violation = tuple[str, str]
@@ -106,6 +106,17 @@ class EntryCursor(Generic[Entry]):
             self.broken = True
             yield self.file, self._error
             self._error = ""
+
+
+def read_json_file(root: Path, file: str) -> Generator[Violation, None, list[object]]:
+    """Return a list of the JSON value of a file, relative to the dataset; the list is empty after a violation."""
+    try:
+        return [read_json(root / file)]
+    except FileNotFoundError:
+        yield file, "is missing"
+    except (OSError, ValueError) as error:
+        yield file, f"cannot be read ({error})"
+    return []
 
 
 def _unexpected(index: int) -> str:

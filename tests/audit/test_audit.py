@@ -310,7 +310,7 @@ def test_missing_files_that_describe_frames_are_violations(dataset: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "damage", [b"", b"{", b"[1, 2]", b'{"images": 3, "annotations": [3], "frames": [{}]}', b"\xff"]
+    "damage", [b"", b"{", b"null", b"[1, 2]", b'{"images": 3, "annotations": [3], "frames": [{}]}', b"\xff"]
 )
 def test_damaged_annotations_are_one_violation_per_file(dataset: Path, damage: bytes) -> None:
     """Each damaged file gives one violation and no traceback, for any content."""

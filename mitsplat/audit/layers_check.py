@@ -67,13 +67,11 @@ class LayersCheck(DatasetCheck):
         if normals in frame.record["files"]:
             yield from ((normals, text) for text in _check_normals(frame, normals, channels))
         if self._last is not None:
-            yield from self._check_flow(frame)
+            yield from self._check_flow(frame, *self._last)
         self._last = None if depth is None else (frame, depth, step)
 
-    def _check_flow(self, frame: DecodedFrame) -> Violations:
+    def _check_flow(self, frame: DecodedFrame, before: DecodedFrame, depth: Float64Array, step: float) -> Violations:
         """Compare the flow of the previous frame with that computed from its depth, both cameras and the poses."""
-        assert self._last is not None  # noqa: S101
-        before, depth, step = self._last
         file = f"flow/{before.split}/{before.index:06d}.flo"
         expected = "next" in before.record or frame.record["layout"] == before.record["layout"]
         if frame.index != before.index + 1 or not expected:

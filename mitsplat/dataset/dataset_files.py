@@ -60,6 +60,11 @@ _WRITTEN = re.compile(
 """Names of all files that mitsplat writes into the subfolders of a dataset, relative to the dataset."""
 
 
+def layout_file(index: int) -> str:
+    """Return the name of the file of a layout, relative to the dataset."""
+    return f"layouts/{index:04d}.json"
+
+
 def is_unfinished(name: str) -> bool:
     """Return True if a file of this name may be in a folder before ``dataset.json`` exists."""
     return _UNFINISHED.fullmatch(name) is not None

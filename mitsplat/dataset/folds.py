@@ -13,8 +13,8 @@ left out. Ultralytics resolves paths that begin with ``./`` from the folder of t
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ from mitsplat.dataset.records.record_schema import read_content
 from mitsplat.errors import InputError
 from mitsplat.formats.coco import append_instances, create_instances_file, image_file
 from mitsplat.formats.yolo import TASKS, names_yaml
-from mitsplat.storage.files import GrowingFile, storage_errors, write_text
+from mitsplat.storage.files import GrowingFile, Record, storage_errors, write_text
 from mitsplat.storage.json_stream import ListsFile
 
 
@@ -60,12 +60,7 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
     classes, keypoints = content["classes"], content["keypoints"]
     tasks = [task for task in TASKS if task in formats]
     with open_finished(root, content, write=True) as records, storage_errors(root), ExitStack() as cleanup:
-        layouts: defaultdict[int, Counter[str]] = defaultdict(Counter)
-        images = Counter[int]()
-        for record in records:
-            if record["split"] != "test":
-                layouts[record["layout"]].update(label["class"] for label in record["labels"]["instances"])
-                images[record["layout"]] += 1
+        layouts, images = _count(records)
         if not 2 <= folds <= len(layouts):
             if len(layouts) < 2:
                 raise InputError(f"{root}: must have at least 2 layouts to be divided into folds (got {len(layouts)})")
@@ -101,14 +96,23 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
                 text = f"# Paths are relative to this file.\ntrain: ../{name}_train.txt\nval: ../{name}_val.txt\n"
                 text += names_yaml(classes, keypoints if task == "yolo-pose" else None)
                 write_text(root / f"{TASKS[task].folder}folds/{name}.yaml", text)
-    statistics = []
-    for fold in range(folds):
-        members = [layout for layout in layouts if fold_of[layout] == fold]
-        instances = sum((layouts[layout] for layout in members), Counter[str]())
-        statistics.append(
-            Fold(len(members), sum(images[layout] for layout in members), dict(sorted(instances.items())))
-        )
-    return statistics
+    members = [[layout for layout in layouts if fold_of[layout] == fold] for fold in range(folds)]
+    instances = [sum((layouts[layout] for layout in own), Counter[str]()) for own in members]
+    return [
+        Fold(len(own), sum(images[layout] for layout in own), dict(sorted(found.items())))
+        for own, found in zip(members, instances, strict=True)
+    ]
+
+
+def _count(records: Iterable[Record]) -> tuple[dict[int, Counter[str]], Counter[int]]:
+    """Return the number of instances by class, and the number of images, of each layout; the test split is left out."""
+    layouts, images = dict[int, Counter[str]](), Counter[int]()
+    for record in records:
+        if record["split"] != "test":
+            classes = (label["class"] for label in record["labels"]["instances"])
+            layouts.setdefault(record["layout"], Counter()).update(classes)
+            images[record["layout"]] += 1
+    return layouts, images
 
 
 def assign_folds(layouts: Mapping[int, Counter[str]], folds: int) -> dict[int, int]:

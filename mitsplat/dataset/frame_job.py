@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mitsplat.dataset.dataset_files import LOCK
+from mitsplat.dataset.dataset_files import LOCK, layout_file
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.progress import Note, discard_note
@@ -95,7 +95,7 @@ class FrameJob:
         """
         if self._cached_layout is not None and self._cached_layout.index == index:
             return self._cached_layout
-        path = self._layout_path(index)
+        path = self.out / layout_file(index)
         with storage_errors(self.out), open_in_place(path.parent / LOCK, "ab") as lock:
             fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; released with the file or the process
             if not path.exists():
@@ -106,16 +106,13 @@ class FrameJob:
     def settle_ahead(self, layouts: Sequence[int]) -> None:
         """Settle the layouts that have no file, except those that another process settles at that moment."""
         for index in layouts:
-            path = self._layout_path(index)
+            path = self.out / layout_file(index)
             if path.exists():
                 continue
             with suppress(BlockingIOError), open_in_place(path.parent / LOCK, "ab") as lock:
                 fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, index)
                 if not path.exists():
                     write_text(path, self.settle_to_json(index, discard_note))
-
-    def _layout_path(self, index: int) -> Path:
-        return self.out / f"layouts/{index:04d}.json"
 
     def load_layout(self, text: str | bytes) -> Layout:
         """Parse a layout from JSON and cache it; return the cached object if the index is the same.
@@ -161,7 +158,7 @@ class RemoteFrame:
             OSError: If they cannot be written.
             PartialResultError: If a file was damaged in transfer.
         """
-        layout = out / f"layouts/{self.record['layout']:04d}.json"
+        layout = out / layout_file(self.record["layout"])
         if not layout.exists():
             write_text(layout, self.layout)
         written: dict[str, Path] = {}
@@ -190,7 +187,7 @@ class RemoteFrameJob:
 
     def cached_layout(self, layout: int) -> str | None:
         """Return a layout from the dataset folder, or None; must be called on the machine that has the folder."""
-        path = self.job.out / f"layouts/{layout:04d}.json"
+        path = self.job.out / layout_file(layout)
         return path.read_text() if path.exists() else None
 
     def settle(self, layout: int) -> str:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mitsplat.arguments import check_type, path_of
-from mitsplat.dataset.dataset_files import TIMINGS
+from mitsplat.dataset.dataset_files import TIMINGS, layout_file
 from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.records.manifest import append_line
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
@@ -79,7 +79,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
             )
             layout = replace(frame.layout, index=index)
             with storage_errors(out):
-                write_text(out / f"layouts/{index:04d}.json", json.dumps(layout.to_json()))
+                write_text(out / layout_file(index), json.dumps(layout.to_json()))
                 record = write_frame(replace(frame, plan=plan), out, scene.spec, catalogue, custom_layout=True)
                 if is_film:
                     record["next"] = index + 1

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import SupportsIndex
 
 from mitsplat.arguments import path_of
-from mitsplat.dataset.dataset_files import CONTENT, MANIFEST, is_written, refuse_links
+from mitsplat.dataset.dataset_files import CONTENT, MANIFEST, is_written, layout_file, refuse_links
 from mitsplat.dataset.dataset_folder import DEFAULT_CONTENT, content_of, first_difference
 from mitsplat.dataset.frame_job import FrameJob, Render, Settle
 from mitsplat.dataset.preflight import count_faults, image_faults, layout_faults, refuse
@@ -89,12 +89,12 @@ def rerender_frame(
         raise InputError(f"{out} must be absent, empty, or hold a frame of an earlier call (it holds other files)")
     refuse_links(out)
     used_device = current_device() if device is None else use_device(device)
-    layout_file = f"layouts/{layout:04d}.json"
+    file = layout_file(layout)
     job = FrameJob(scene, catalogue, out, render, settle)
     with storage_errors(out):
         text = job.settle_to_json(layout, discard_note)
         _remove_frame(out)
-        write_text(out / layout_file, text)
+        write_text(out / file, text)
         record, _ = job.write(index, job.load_layout(text))
         write_text(out / FRAME, json.dumps(record, indent=1) + "\n")
     dataset = None if dataset is None else Path(dataset)
@@ -102,11 +102,11 @@ def rerender_frame(
     if dataset is None or stored is None:
         return RerenderedFrame(out, record)
     before, now = stored["files"], record["files"]
-    differing = sorted(file for file in {*before, *now} if before.get(file) != now.get(file))
+    differing = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
     if stored != {**json.loads(json.dumps(record)), "files": before}:
         differing.append(MANIFEST)
-    if (dataset / layout_file).is_file() and (dataset / layout_file).read_bytes() != text.encode():
-        differing.append(layout_file)
+    if (dataset / file).is_file() and (dataset / file).read_bytes() != text.encode():
+        differing.append(file)
     difference = first_difference(
         DEFAULT_CONTENT | read_json(dataset / CONTENT), content_of(scene, catalogue, used_device.kind)
     )

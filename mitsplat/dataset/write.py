@@ -29,7 +29,7 @@ from itertools import groupby
 from pathlib import Path
 
 from mitsplat.arguments import check_whole_number, path_of
-from mitsplat.dataset.dataset_files import SHEET, TIMINGS, remove_folds
+from mitsplat.dataset.dataset_files import SHEET, TIMINGS, layout_file, remove_folds
 from mitsplat.dataset.dataset_folder import Shard, append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.frame_job import FrameJob, RemoteFrameJob, Render, Settle, layout_errors
 from mitsplat.dataset.preflight import refuse, run_faults
@@ -168,7 +168,7 @@ def write_dataset(
             _begin_run(out, workers, used_device)
         incomplete = IncompleteLayouts(scene, -(-count // scene.spec.output.views))
         for layout in sorted({layout_index_of(scene, index) for index in indices}):
-            incomplete.read(out / f"layouts/{layout:04d}.json")
+            incomplete.read(out / layout_file(layout))
         job = FrameJob(scene, catalogue, out, render or render_frame, settle or settle_layout)
         num_missing = sum(map(len, layouts.values()))
         unsettled = [layout for layout in layouts if settle is not None or not is_cached(scene, layout)]

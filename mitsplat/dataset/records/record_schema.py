@@ -25,14 +25,14 @@ from mitsplat.geometry.lens import Lens
 from mitsplat.images.masks import decode_rle
 from mitsplat.scene.spec.camera_spec import CameraSpec
 from mitsplat.scene.spec.scene_spec import LabelRules, Output
-from mitsplat.storage.field_types import Name
+from mitsplat.storage.field_types import Name, Positive, Unit
 from mitsplat.storage.file_kinds import no_folder_with
 from mitsplat.storage.files import JsonObject, Record, open_regular, read_json, splits_of
 from mitsplat.storage.format_version import FORMAT_VERSIONS, check_format_version
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Pixels = Annotated[int, Field(ge=1, lt=2**31)]
-Share = Annotated[float, Field(ge=0, le=1)]
+InstanceId = Annotated[int, Field(ge=1, le=65535)]
 Bounds = tuple[int, int, int, int]
 Point = tuple[float, float, float]
 Row = tuple[float, float, float, float]
@@ -72,13 +72,13 @@ class _Camera(_Stored):
     distortion: list[float]
     lens: Lens
     aperture_radius: Annotated[float, Field(ge=0)]
-    focus_distance: Annotated[float, Field(gt=0)]
-    near: Annotated[float, Field(gt=0)]
+    focus_distance: Positive
+    near: Positive
     world_from_camera: Pose
 
 
 class _Instance(_Stored):
-    id: Annotated[int, Field(ge=1, le=65535)]
+    id: InstanceId
     asset: Count
     class_index: Count
     class_name: Annotated[str, Field(alias="class")]
@@ -89,11 +89,11 @@ class _Instance(_Stored):
     silhouette_box: Bounds
     silhouette_area: Pixels
     depth_area: Count
-    visible_fraction: Share
-    truncation: Share
-    polygon_iou: Share
-    agreement: Share
-    boundary_f1: Share
+    visible_fraction: Unit
+    truncation: Unit
+    polygon_iou: Unit
+    agreement: Unit
+    boundary_f1: Unit
     marks: list[str]
     keypoints: list[Point]
     world_from_object: Pose
@@ -114,25 +114,25 @@ class _Environment(_Stored):
 
 
 class _Drawn(_Stored):
-    id: Annotated[int, Field(ge=1, le=65535)]
+    id: InstanceId
     entry: Count
     asset: Count
     name: str
-    scale: Annotated[float, Field(gt=0)]
+    scale: Positive
     label: bool
     region: str | None = None
 
 
 class _Appearance(_Stored):
-    id: Annotated[int, Field(ge=1, le=65535)]
+    id: InstanceId
     entry: Count
     hue: float
     saturation: float
     value: float
     gain: Point
     roughness: Annotated[float, Field(gt=0, le=1)]
-    specular: Share
-    wear: Share
+    specular: Unit
+    wear: Unit
     wear_seed: Count
 
 
@@ -152,7 +152,7 @@ class _Predicted(_Stored):
 
 
 class _Motion(_Stored):
-    exposure: Annotated[float, Field(gt=0)]
+    exposure: Positive
 
 
 class _Viewpoint(_Stored):
@@ -160,14 +160,14 @@ class _Viewpoint(_Stored):
 
     motion: _Motion | None = None
     target: Point | None = None
-    object: Annotated[int, Field(ge=1, le=65535)] | None = None
+    object: InstanceId | None = None
     attempt: Count = 0
     predicted: _Predicted | None = None
 
 
 class _OrderError(_Stored):
-    largest: Share
-    mean: Share
+    largest: Unit
+    mean: Unit
 
 
 class _DrawnEnvironment(_Stored):
@@ -178,7 +178,7 @@ class _DrawnEnvironment(_Stored):
 class _Finish(_Stored):
     kind: str
     colours: list[Point] = []
-    scale: Annotated[float, Field(gt=0)]
+    scale: Positive
     rotate: float
     offset: tuple[float, float]
     image: str | None = None
@@ -188,9 +188,9 @@ class _Finish(_Stored):
 class _Backing(_Stored):
     image: str
     crop: Annotated[float, Field(gt=0, le=1)]
-    place: tuple[Share, Share]
+    place: tuple[Unit, Unit]
     rotate: float
-    gain: Annotated[float, Field(gt=0)]
+    gain: Positive
 
 
 class _Place(_Stored):
@@ -204,7 +204,7 @@ class _Conveyor(_Stored):
 
 
 class _LeftOut(_Stored):
-    id: Annotated[int, Field(ge=1, le=65535)]
+    id: InstanceId
     asset: Count
     name: str
     reason: str
@@ -220,8 +220,8 @@ class _Record(_Stored):
     camera: _Camera
     labels: _Labels
     environment: _Environment | None = None
-    depth_scale: Annotated[float, Field(gt=0)] | None = None
-    depth_sensor_scale: Annotated[float, Field(gt=0)] | None = None
+    depth_scale: Positive | None = None
+    depth_sensor_scale: Positive | None = None
     objects: list[_Drawn] | None = None
     appearance: list[_Appearance] | None = None
     viewpoint: _Viewpoint | None = None

@@ -6,6 +6,7 @@ Each command imports its dependencies inside its function, so that all other com
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -105,7 +106,6 @@ def bake(
     from mitsplat.bake.bake_report import write_bake_report
     from mitsplat.bake.size_checks import describe_size
     from mitsplat.bake.surface_materials import SurfaceFinish
-    from mitsplat.mesh_files.step import STEP_SUFFIXES, read_step, separate_parts
 
     _check_folder(out, mesh, name, overwrite=overwrite)
     if units is not None and not 0 < units < math.inf:
@@ -116,18 +116,7 @@ def bake(
         raise InputError(f"--name applies to one asset, but --split names each by its part (got {name})")
     settings = BakeSettings(gaussians=gaussians, seed=seed)
     finish = SurfaceFinish(colour=colour, roughness=roughness, metallic=metallic, specular=specular)
-    sources: dict[Path, MeshFile | Path] = {out: mesh}
-    if mesh.suffix.lower() in STEP_SUFFIXES:
-        file = read_step(mesh, tolerance=tolerance, separate=split)
-        typer.echo(f"facets: within {file.tolerance:.3g} mm of the surfaces")
-        sources = {out: file}
-        if split:
-            parts = separate_parts(file)
-            sources = {out / part: content for part, (content, _) in parts.items()}
-            for part, (_, count) in parts.items():
-                typer.echo(f"part: {part} ({count} of {len(file.parts)} parts)")
-    elif tolerance is not None or split:
-        raise InputError(f"--{'split' if split else 'tolerance'} applies to STEP files (got {mesh})")
+    sources = _bake_sources(mesh, out, tolerance=tolerance, split=split)
     for folder in sources:
         _check_folder(folder, mesh, name, overwrite=overwrite)
     select_device(device)
@@ -156,6 +145,24 @@ def bake(
             typer.echo(f"size: {describe_size(result.asset.mesh)}")
         typer.echo(f"report: {report}")
         typer.echo(f"asset: {folder} ({len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB on unseen views)")
+
+
+def _bake_sources(mesh: Path, out: Path, *, tolerance: float | None, split: bool) -> Mapping[Path, MeshFile | Path]:
+    """Return the source of each asset by its folder: the mesh file, or the content of a STEP file or of its parts."""
+    from mitsplat.mesh_files.step import STEP_SUFFIXES, read_step, separate_parts
+
+    if mesh.suffix.lower() not in STEP_SUFFIXES:
+        if tolerance is not None or split:
+            raise InputError(f"--{'split' if split else 'tolerance'} applies to STEP files (got {mesh})")
+        return {out: mesh}
+    file = read_step(mesh, tolerance=tolerance, separate=split)
+    typer.echo(f"facets: within {file.tolerance:.3g} mm of the surfaces")
+    if not split:
+        return {out: file}
+    parts = separate_parts(file)
+    for part, (_, count) in parts.items():
+        typer.echo(f"part: {part} ({count} of {len(file.parts)} parts)")
+    return {out / part: content for part, (content, _) in parts.items()}
 
 
 def import_(

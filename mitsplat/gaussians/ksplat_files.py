@@ -8,12 +8,13 @@ on, positions are unsigned 16-bit numbers relative to the centre of a bucket.
 from __future__ import annotations
 
 import struct
-from typing import NamedTuple
 
 import numpy as np
 
 from mitsplat.arrays import AnyArray, Float64Array
 from mitsplat.errors import InputError
+from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_arrays import SplatArrays
 
 _HEADER, _SECTION_HEADER = 4096, 1024
 _VERSION = (0, 1)
@@ -30,25 +31,7 @@ _LEAST_SCALE = 2.0**-24
 """Smallest positive 16-bit number, in place of scales that were rounded to 0."""
 
 
-class KsplatRows(NamedTuple):
-    """Gaussians of a file.
-
-    Attributes:
-        means: Positions, shape (N, 3).
-        quats: Rotations w, x, y, z, shape (N, 4).
-        scales: Standard deviations, shape (N, 3).
-        colours: Red, green, blue and opacity, 0 to 1, shape (N, 4).
-        sh: SH coefficients of degree 1 and 2, shape (N, K, 3).
-    """
-
-    means: Float64Array
-    quats: Float64Array
-    scales: Float64Array
-    colours: Float64Array
-    sh: Float64Array
-
-
-def read_ksplat(data: bytes) -> KsplatRows:
+def decode_ksplat(data: bytes) -> SplatArrays:
     """Decode a file; its allocations are limited by its size.
 
     Raises:
@@ -67,20 +50,20 @@ def read_ksplat(data: bytes) -> KsplatRows:
     if start > len(data):
         raise InputError("not a valid ksplat file (the headers of its sections are incomplete)")
     for number in range(sections):
-        rows, start = _read_section(data, _HEADER + number * _SECTION_HEADER, start, level, sh_range)
-        found.append(rows)
-    if len({rows.sh.shape[1] for rows in found}) > 1:
+        arrays, start = _read_section(data, _HEADER + number * _SECTION_HEADER, start, level, sh_range)
+        found.append(arrays)
+    if len({arrays.sh.shape[1] for arrays in found}) > 1:
         raise InputError("sections of ksplat files must have the same SH degree")
     if not found:
         raise InputError("not a valid ksplat file (it has no sections)")
-    if (count := sum(len(rows.means) for rows in found)) != stated:
+    if (count := sum(len(arrays.means) for arrays in found)) != stated:
         raise InputError(f"the sections of a ksplat file must hold all {stated} Gaussians of its header (got {count})")
-    return KsplatRows(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
+    return SplatArrays(*(np.concatenate(sections) for sections in zip(*found, strict=True)))
 
 
 def _read_section(
     data: bytes, header: int, start: int, level: int, sh_range: tuple[float, float]
-) -> tuple[KsplatRows, int]:
+) -> tuple[SplatArrays, int]:
     """Read the section whose header and data are at ``header`` and ``start``; return its end, too."""
     count, maximum, bucket_size, buckets = struct.unpack_from("<4I", data, header)
     block, bucket_bytes, number_range = struct.unpack_from("<fH2xI", data, header + 16)
@@ -113,16 +96,16 @@ def _read_section(
     sh = rows["sh"].astype(np.float64)
     if level == 2:
         sh = sh_range[0] + sh / 255 * (sh_range[1] - sh_range[0])
-    return (
-        KsplatRows(
-            means,
-            rows["rotation"].astype(np.float64),
-            np.maximum(rows["scale"].astype(np.float64), _LEAST_SCALE if level else 0.0),
-            rows["colour"] / 255.0,
-            _by_channel(sh),
-        ),
-        end,
+    colours = rows["colour"] / 255.0
+    constant = (colours[:, None, :3] - 0.5) / SH_C0
+    arrays = SplatArrays(
+        means=means.astype(np.float32),
+        quats=rows["rotation"].astype(np.float32),
+        scales=np.maximum(rows["scale"].astype(np.float64), _LEAST_SCALE if level else 0.0).astype(np.float32),
+        opacities=colours[:, 3].astype(np.float32),
+        sh=np.concatenate([constant, _by_channel(sh)], axis=1).astype(np.float32),
     )
+    return arrays, end
 
 
 def _by_channel(sh: AnyArray) -> Float64Array:

@@ -29,7 +29,7 @@ from typing import Literal
 import numpy as np
 
 from mitsplat.errors import InputError
-from mitsplat.gaussians.ksplat_files import read_ksplat
+from mitsplat.gaussians.ksplat_files import decode_ksplat
 from mitsplat.gaussians.ply_files import MAX_PLY_HEADER, decode_ply, encode_ply, examine_columns
 from mitsplat.gaussians.sog_files import decode_sog
 from mitsplat.gaussians.spherical_harmonics import SH_C0
@@ -108,7 +108,7 @@ def _decode(data: bytes, suffix: str) -> tuple[SplatArrays, KernelName | None, l
     if suffix == ".sog":
         return *decode_sog(data), []
     if suffix == ".ksplat":
-        return _decode_ksplat(data), None, []
+        return decode_ksplat(data), None, []
     arrays = decode_ply(data)
     warnings, kernel = examine_columns(data, arrays.sh[:, 0])
     return arrays, kernel, warnings
@@ -172,10 +172,3 @@ def _encode_splat(splats: SplatArrays, _kernel: KernelName | None) -> bytes:
     rows["rgba"] = np.rint(255.0 * np.clip(rgba, 0.0, 1.0))
     rows["quat"] = np.clip(np.rint(128.0 * splats.quats[:, [3, 0, 1, 2]] + 128.0), 0.0, 255.0)
     return rows.tobytes()
-
-
-def _decode_ksplat(data: bytes) -> SplatArrays:
-    means, quats, scales, colours, sh = read_ksplat(data)
-    constant = (colours[:, None, :3] - 0.5) / SH_C0
-    arrays = (means, quats, scales, colours[:, 3], np.concatenate([constant, sh], axis=1))
-    return SplatArrays(*(values.astype(np.float32) for values in arrays))

@@ -415,11 +415,6 @@ class _CreaseIndex:
         first = np.argmax(alike, axis=1)
         return np.unique(index[np.arange(len(index)), first][alike.any(axis=1)])
 
-    @property
-    def length(self) -> float:
-        """Total length of all creases [m]."""
-        return float(self.lengths.sum())
-
     def distance(self, points: Float64Array, reach: float) -> Float64Array:
         """Return distances (N,) [m] to the nearest crease; infinite beyond ``reach`` [m] or without creases."""
         if self.tree is None:

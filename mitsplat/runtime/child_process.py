@@ -137,10 +137,7 @@ def run_function() -> None:
     data = sys.stdin.buffer.read()
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # libraries print to stdout
-    bound = _address_space() + int(memory)
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    if most == resource.RLIM_INFINITY or bound < most:
-        resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
+    limit_memory(int(memory))
     try:
         function(output, data, *arguments)
         output.flush()

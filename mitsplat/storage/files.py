@@ -59,8 +59,7 @@ def write_file(path: Path, write: Callable[[Path], object]) -> str:
     Returns:
         The SHA-256 of the content.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = _temporary_path(path)
     try:
         temporary.unlink(missing_ok=True)  # a link of this name would be followed
         write(temporary)
@@ -77,6 +76,12 @@ def write_file(path: Path, write: Callable[[Path], object]) -> str:
     return digest
 
 
+def _temporary_path(path: Path) -> Path:
+    """Return the path of an unfinished file of this process, and create its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path.with_name(f".{path.name}.{os.getpid()}.part")
+
+
 class GrowingFile:
     """A text file that is written incrementally under a temporary name and renamed atomically at the end.
 
@@ -85,8 +90,7 @@ class GrowingFile:
     """
 
     def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._path, self._temporary = path, path.with_name(f".{path.name}.{os.getpid()}.part")
+        self._path, self._temporary = path, _temporary_path(path)
         self._temporary.unlink(missing_ok=True)
         self._file = self._temporary.open("x+b", buffering=1 << 16)
         self._renamed = False

@@ -121,39 +121,29 @@ def read_entries(path: Path) -> Iterator[tuple[str, Any]]:
 def _read_object(path: Path, *, lists: bool) -> Iterator[tuple[str, Any]]:
     with io.TextIOWrapper(open_regular(path), encoding="utf-8") as file:
         window = _Window(file)
-        window.expect("{")
-        if window.peek() == "}":
-            window.expect("}")
-        else:
-            while True:
-                key = window.value()
-                if not isinstance(key, str):
-                    raise ValueError(f"a key must be a string (got {str(key)[:40]})")
-                window.expect(":")
-                if lists and window.peek() == "[":
-                    for element in _elements(window):
-                        yield key, element
-                else:
+        for _ in _items(window, "{", "}"):
+            key = window.value()
+            if not isinstance(key, str):
+                raise ValueError(f"a key must be a string (got {str(key)[:40]})")
+            window.expect(":")
+            if lists and window.peek() == "[":
+                for _ in _items(window, "[", "]"):
                     yield key, window.value()
-                if window.peek() != ",":
-                    break
-                window.expect(",")
-            window.expect("}")
+            else:
+                yield key, window.value()
         if window.peek():
             raise ValueError(f"must end after the closing brace (got {window.peek()!r})")
 
 
-def _elements(window: _Window) -> Iterator[Any]:
-    window.expect("[")
-    if window.peek() == "]":
-        window.expect("]")
-        return
-    while True:
-        yield window.value()
-        if window.peek() != ",":
-            break
-        window.expect(",")
-    window.expect("]")
+def _items(window: _Window, first: str, last: str) -> Iterator[None]:
+    """Move to each item of an object or a list in brackets; the caller decodes the item."""
+    window.expect(first)
+    if window.peek() != last:
+        yield
+        while window.peek() == ",":
+            window.expect(",")
+            yield
+    window.expect(last)
 
 
 class _Window:

@@ -41,8 +41,8 @@ def scanned_box(size=(0.12, 0.16, 0.04), *, dent=3e-4, noise=1e-4, points=6000, 
 
 def body_of(*pieces, density=3000.0, **material):
     """Return a body of convex pieces with a contact material."""
+    from mitsplat.physics.bodies import Body
     from mitsplat.physics.friction import ContactMaterial
-    from mitsplat.physics.worlds import Body
 
     mass = mass_properties(trimesh.util.concatenate(list(pieces)), pieces, density=density)
     return Body(pieces, mass, ContactMaterial(**material))
@@ -50,8 +50,8 @@ def body_of(*pieces, density=3000.0, **material):
 
 def table(pose=None, size=1.0, **material):
     """Return a box with a square top [m] in the plane z = 0 of its pose."""
+    from mitsplat.physics.bodies import Collider
     from mitsplat.physics.friction import ContactMaterial
-    from mitsplat.physics.worlds import Collider
 
     top_from_box = trimesh.transformations.translation_matrix((0, 0, -0.05))
     return Collider(
@@ -61,7 +61,8 @@ def table(pose=None, size=1.0, **material):
 
 def world_of(stepper, bodies, colliders, poses, *, timestep=0.002, capacity=1.0):
     """Return the simulation of bodies at their poses."""
-    from mitsplat.physics.worlds import MujocoWorld, WarpWorld
+    from mitsplat.physics.mujoco_world import MujocoWorld
+    from mitsplat.physics.warp_world import WarpWorld
 
     if stepper == "mujoco":
         world = MujocoWorld(bodies, colliders, timestep=timestep)

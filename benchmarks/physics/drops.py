@@ -147,8 +147,10 @@ def drop_batch(batch: Batch) -> tuple[Batch, Float64Array, Float64Array, float, 
 
 @lru_cache(maxsize=1)
 def make_world(part_name: str, stepper: str, restitution: float) -> World:
+    from mitsplat.physics.bodies import Body, Collider
     from mitsplat.physics.friction import ContactMaterial
-    from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld
+    from mitsplat.physics.mujoco_world import MujocoWorld
+    from mitsplat.physics.warp_world import WarpWorld
 
     part, place = make_part(part_name), np.eye(4)
     place[2, 3] = -0.05

@@ -258,7 +258,9 @@ def measure_rest(count: int) -> None:
 
 def measure_restitution(count: int) -> None:
     """Drop ``count`` boxes with each restitution; their heights, 0.1 to 0.4 m, and densities are random."""
-    from mitsplat.physics.worlds import Body, Collider, MujocoWorld, WarpWorld
+    from mitsplat.physics.bodies import Body, Collider
+    from mitsplat.physics.mujoco_world import MujocoWorld
+    from mitsplat.physics.warp_world import WarpWorld
 
     side, place = 0.02, np.eye(4)
     place[2, 3] = -0.05

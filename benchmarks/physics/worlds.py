@@ -12,10 +12,12 @@ from newton.solvers import SolverMuJoCo
 
 from benchmarks.record import figure
 from mitsplat.arrays import Float64Array
-from mitsplat.physics import worlds as physics
-from mitsplat.physics.friction import PairContactSolver
+from mitsplat.physics import newton_model as physics
+from mitsplat.physics.bodies import Body, Collider
+from mitsplat.physics.contact_solver import PairContactSolver
 from mitsplat.physics.rest import run_to_rest
-from mitsplat.physics.worlds import Body, Collider, World
+from mitsplat.physics.warp_world import assign_array
+from mitsplat.physics.worlds import STEPS, World
 
 WORLDS = 1, 8, 64, 256
 DURATION = 2.5  # simulated time to rest and one second after [s]
@@ -53,7 +55,7 @@ def time_worlds(
 
 
 class Batch:
-    """Steps of :class:`mitsplat.physics.worlds.WarpWorld` in several worlds at once, including roll friction."""
+    """Steps of :class:`mitsplat.physics.warp_world.WarpWorld` in several worlds at once, including roll friction."""
 
     def __init__(
         self,
@@ -80,8 +82,8 @@ class Batch:
         self._contacts, self._control = self._pipeline.contacts(), model.control()
         self._states, self._timestep = (model.state(), model.state()), timestep
         overflow = {SolverMuJoCo.ObservableKind.OVERFLOW}
-        self._observables = [self._solver.observables(overflow) for _ in range(physics.STEPS)]
-        self.interval = physics.STEPS * timestep
+        self._observables = [self._solver.observables(overflow) for _ in range(STEPS)]
+        self.interval = STEPS * timestep
         self._record()
         with wp.ScopedCapture(device=device) as capture:
             self._record()
@@ -90,10 +92,10 @@ class Batch:
         coordinates = np.concatenate([physics.body_coordinates(bodies, poses) for poses in starts])
         state = self._states[0]
         self._solver.reset(state)
-        physics.assign_array(state.joint_q, coordinates.ravel())
-        physics.assign_array(state.body_q, coordinates)
-        physics.assign_array(state.joint_qd, np.zeros(6 * len(coordinates)))
-        physics.assign_array(state.body_qd, np.zeros((len(coordinates), 6)))
+        assign_array(state.joint_q, coordinates.ravel())
+        assign_array(state.body_q, coordinates)
+        assign_array(state.joint_qd, np.zeros(6 * len(coordinates)))
+        assign_array(state.body_qd, np.zeros((len(coordinates), 6)))
 
     def _record(self) -> None:
         here, there = self._states
@@ -126,7 +128,7 @@ def has_rested(
         """A recorded simulation, frame by frame."""
 
         def __init__(self) -> None:
-            super().__init__(bodies, timestep=interval / physics.STEPS)
+            super().__init__(bodies, timestep=interval / STEPS)
             self._frames = iter(frames[:, : len(bodies)])
             self._frame = next(self._frames)
 

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
+import newton
 import numpy as np
 import trimesh
 
+from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.decomposition import MAX_PIECES, convex_pieces, max_gap
 from mitsplat.geometry.hull_facets import merge_facets
-from mitsplat.geometry.mesh import mass_properties, prepare_mesh
+from mitsplat.geometry.mesh import MassProperties, join_meshes, mass_properties, prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
+from mitsplat.physics.contacts import newton_hull
 from mitsplat.physics.friction import ContactMaterial
-from mitsplat.physics.worlds import Body, Collider
 from mitsplat.progress import Note
 from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.walls import bin_walls, pose_matrix
@@ -25,6 +28,52 @@ _CONCAVITIES = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to
 # facet of each body, in each step of another one, so that a stack of three scanned boxes creeps at 3 mm/s. Facets are
 # merged within an angle [degrees] and a depth [m], or share of the size: then it creeps at less than 0.01 mm/s.
 _SCAN_FACETS, _FACET_ANGLE, _FACET_DEPTH, _FACET_DEPTH_SHARE = 300, 1.5, 3e-4, 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Dynamic rigid body. Bodies of one asset share it."""
+
+    pieces: tuple[trimesh.Trimesh, ...]
+    mass: MassProperties
+    material: ContactMaterial
+
+    @cached_property
+    def outline(self) -> Float64Array:
+        """Vertices of the convex hull [m], shape (N, 3). The largest displacement of the body occurs at one of them."""
+        return np.asarray(join_meshes(self.pieces).convex_hull.vertices, dtype=np.float64)
+
+    @cached_property
+    def size(self) -> float:
+        """Longest extent [m]."""
+        return float(np.ptp(self.outline, axis=0).max())
+
+    @cached_property
+    def hulls(self) -> list[newton.Mesh]:
+        """The pieces as Newton meshes."""
+        return [newton_hull(piece) for piece in self.pieces]
+
+
+@dataclass(frozen=True, eq=False)
+class Collider:
+    """Static collider: convex pieces in world space, or a box by its full ``size`` [m] and pose (4, 4)."""
+
+    material: ContactMaterial
+    pieces: tuple[trimesh.Trimesh, ...] = ()
+    box: tuple[tuple[float, float, float], Float64Array] | None = None
+
+    def moved(self, motion: Float64Array) -> Collider:
+        """Return the collider after a rigid transform (4, 4)."""
+        pieces = tuple(piece.copy().apply_transform(motion) for piece in self.pieces)
+        return replace(self, pieces=pieces, box=None if self.box is None else (self.box[0], motion @ self.box[1]))
+
+
+def all_pieces(bodies: Iterable[Body], colliders: Iterable[Collider]) -> Iterator[trimesh.Trimesh]:
+    """Yield the convex pieces of all bodies and colliders."""
+    for body in bodies:
+        yield from body.pieces
+    for collider in colliders:
+        yield from collider.pieces
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,11 @@ import numpy as np
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.geometry.mesh_distance import PlacedSurface, all_clearances
 from mitsplat.physics.bodies import Part, make_part
-from mitsplat.physics.certificate import MAX_MEASURED_GAP, RestingObject, RestingState
+from mitsplat.physics.certificate import RestingObject, RestingState
 from mitsplat.physics.handling import draw_handling
-from mitsplat.physics.placement import PUT_DOWN, Item, draw_poses
+from mitsplat.physics.mujoco_world import MujocoWorld
+from mitsplat.physics.placement import PUT_DOWN, Item
 from mitsplat.physics.rest import (
     CONTACT_OVERFLOW,
     FREE_TIME,
@@ -29,8 +29,10 @@ from mitsplat.physics.rest import (
     observe_nothing,
     run_to_rest,
 )
-from mitsplat.physics.static_scene import StaticScene, make_static_scene
-from mitsplat.physics.worlds import MujocoWorld, WarpWorld, World
+from mitsplat.physics.start_poses import StartPoses
+from mitsplat.physics.static_scene import make_static_scene
+from mitsplat.physics.warp_world import WarpWorld
+from mitsplat.physics.worlds import World
 from mitsplat.progress import Note, discard_note
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout, LeftOut, RestCertificate, UnsettledLayoutError
 from mitsplat.scene.planning.contents import draw_arrangements, draw_objects, draw_regions
@@ -38,12 +40,8 @@ from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.splits import draw_environment
 from mitsplat.scene.streams import random_stream
-from mitsplat.scene.walls import (
-    pose_matrix,
-)
 
 TIMESTEP = 0.002  # of the simulation [s]
-_MAX_START_OVERLAP = 1e-3  # maximum overlap of start poses from the scene file [m]
 # Number of simulations between garbage collections. Newton leaves each model (1 MiB and more) in reference cycles,
 # which Python would collect only after a quarter of all objects. A collection takes 0.5 s.
 _COLLECTION_INTERVAL = 24
@@ -114,6 +112,7 @@ class Drop:
     Attributes:
         scene: The scene.
         objects: Physical part of each asset of the scene.
+        start_poses: Start poses of its objects.
         static_scenes: Colliders and obstacles by the number of the environment, or those of the last layout only.
     """
 
@@ -123,6 +122,7 @@ class Drop:
         self._worlds: dict[tuple[tuple[int, ...], float, int], World] = {}
         self._world_count = 0
         self.objects = [self._part(asset, progress) for asset in scene.assets]
+        self.start_poses = StartPoses(scene, self.objects)
         self._surroundings = (scene.environments if scene.spec.environment_collides else ()) or (None,)
         bodies = [part.body for part in self.objects]
         self.static_scenes = {
@@ -130,7 +130,7 @@ class Drop:
             for number, around in enumerate(self._surroundings)
         }
         for static in self.static_scenes.values():
-            self._check_given_poses(static)
+            self.start_poses.check_given(static)
 
     def settle(self, index: int) -> Layout:
         """Draw poses until a layout passes all checks.
@@ -197,19 +197,32 @@ class Drop:
             arrangements[one.region] = one.arrangement
         return arrangements
 
+    def _items(self, drawn: Sequence[_DrawnObject], given: Sequence[Float64Array | None] = ()) -> list[Item]:
+        """Return objects to place, with the given poses or else those of the scene file."""
+        assets, regions = [one.asset for one in drawn], [one.region for one in drawn]
+        return self.start_poses.items(assets, given or [one.given for one in drawn], regions)
+
+    def draw_poses(
+        self, assets: Sequence[int], rng: np.random.Generator, arrangements: Sequence[Arrangement] | None = None
+    ) -> Float64Array:
+        """Draw start poses of assets in the first region, see :meth:`StartPoses.draw`.
+
+        ``arrangements`` are those of all regions; the first of the scene file if None.
+        """
+        static, arrangements = self.static_scenes[0], arrangements or self._arrangements(())
+        return self.start_poses.draw(self.start_poses.items(assets), static, rng, arrangements)
+
     def _try(self, index: int, drawn: Sequence[_DrawnObject], refused: Sequence[str]) -> Layout | _Rejection:
         """Drop the given objects from the next draw of start poses."""
         number = self._static_key(index)
-        assets, given = tuple(one.asset for one in drawn), [one.given for one in drawn]
-        regions, obstacles = [one.region for one in drawn], self.static_scenes[number].obstacles
-        arrangements = self._arrangements(drawn)
+        assets, static = tuple(one.asset for one in drawn), self.static_scenes[number]
+        items, arrangements = self._items(drawn), self._arrangements(drawn)
         rng = random_stream(self.scene.spec.seed, "object poses", index, len(refused))
         try:
-            start = self.draw_poses(assets, rng, given, number, regions, arrangements)
+            start = self.start_poses.draw(items, static, rng, arrangements)
         except InputError as error:
             # An object that is too large for its region is rejected alone; the others may still fit.
-            items = self._items(assets, given, regions)
-            alone = [self._place([item], number, rng, arrangements) is None for item in items]
+            alone = [self.start_poses.find([item], static, rng, arrangements) is None for item in items]
             reason = "no room for it" if any(alone) else CROWDED
             return _Rejection(reason, np.flatnonzero(alone).tolist(), str(error))
         world = self.world_of(assets, 2.0 ** refused.count(CONTACT_OVERFLOW), number)
@@ -223,13 +236,13 @@ class Drop:
         upright = np.einsum("nj,nj->n", outcome.poses[:, 2, :3], start[:, 2, :3])
         resting = [
             RestingObject(
-                self._placed(one.asset, pose),
+                self.start_poses.placed(one.asset, pose),
                 one.arrangement,
                 None if one.given is not None else float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
             )
             for one, pose, cosine in zip(drawn, outcome.poses, upright, strict=True)
         ]
-        state = RestingState(resting, obstacles)
+        state = RestingState(resting, static.obstacles)
         defect = state.find_defect()
         if defect is not None:
             return _Rejection(defect.reason, defect.causes, simulated=world.time)
@@ -275,14 +288,13 @@ class Drop:
         drawn = [one for one in self._draw_contents(layout.index) if one.id in resting_ids]
         if not drawn:
             return
-        assets, given = tuple(one.asset for one in drawn), [one.given for one in drawn]
-        certificate = layout.certificate
+        assets, certificate = tuple(one.asset for one in drawn), layout.certificate
         attempt = certificate.attempts - 1
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, attempt)
         capacity = 2.0 ** certificate.refused.count(CONTACT_OVERFLOW)
-        number, regions = self._static_key(layout.index), [one.region for one in drawn]
+        number = self._static_key(layout.index)
         world = self.world_of(assets, capacity, number)
-        start = self.draw_poses(assets, rng, given, number, regions, self._arrangements(drawn))
+        start = self.start_poses.draw(self._items(drawn), self.static_scenes[number], rng, self._arrangements(drawn))
         restarted = np.zeros(len(drawn), dtype=bool)
         moments = [(0.0, start, restarted.copy())]
 
@@ -322,8 +334,7 @@ class Drop:
         """Simulate a draw of a layout from its start poses (N, 4, 4); ``rng`` draws those of objects that fail."""
         settle = self.scene.spec.settle
         fastest = _POUR_SPEED if any(one.arrangement == "pile" for one in drawn) else np.inf
-        number, arrangements = self._static_key(index), self._arrangements(drawn)
-        static = self.static_scenes[number]
+        static, arrangements = self.static_scenes[self._static_key(index)], self._arrangements(drawn)
         free = np.array([one.given is None for one in drawn])
         own = np.array([one.region for one in drawn])
 
@@ -336,8 +347,7 @@ class Drop:
             if (failed & ~free).any():
                 return None
             placed = [None if again else pose for again, pose in zip(failed, poses, strict=True)]
-            items = self._items([one.asset for one in drawn], placed, own.tolist())
-            return self._place(items, number, rng, arrangements)
+            return self.start_poses.find(self._items(drawn, placed), static, rng, arrangements)
 
         # Round objects that are put down would roll away without rolling friction.
         falls = PUT_DOWN.isdisjoint(one.arrangement for one in drawn)
@@ -392,92 +402,6 @@ class Drop:
         if id(asset.mesh) not in self._parts:
             self._parts[id(asset.mesh)] = make_part(asset, progress)
         return self._parts[id(asset.mesh)]
-
-    def _check_given_poses(self, static: StaticScene) -> None:
-        """Refuse start poses of the scene file that overlap one another or a collider.
-
-        The simulation would push such objects apart.
-        """
-        keys: dict[PlacedSurface, str] = {}
-        for entry, spec in enumerate(self.scene.spec.objects):
-            for number, pose in enumerate(spec.poses):
-                keys[self._placed(self.scene.pools[entry][0], pose_matrix(pose))] = f"objects[{entry}].poses[{number}]"
-        for pair in all_clearances(list(keys), static.obstacles, reach=MAX_MEASURED_GAP):
-            if -pair.distance > _MAX_START_OVERLAP:
-                other = keys.get(pair.second, f"collider {pair.second.name!r}")
-                raise InputError(
-                    f"{self.scene.path}: {keys[pair.first]}: must not start in {other} "
-                    f"(got an overlap of {-pair.distance * 1e3:.1f} mm)"
-                )
-
-    def draw_poses(
-        self,
-        assets: Sequence[int],
-        rng: np.random.Generator,
-        given: Sequence[Float64Array | None] = (),
-        number: int = 0,
-        regions: Sequence[int] | None = None,
-        arrangements: Sequence[Arrangement] | None = None,
-    ) -> Float64Array:
-        """Draw start poses (N, 4, 4) in static scene ``number``, see :func:`mitsplat.physics.placement.draw_poses`.
-
-        ``arrangements`` are those of all regions; the first of the scene file if None.
-
-        Raises:
-            InputError: If objects find no room.
-        """
-        items = self._items(assets, given, regions)
-        region, arrangements = self.scene.spec.region, arrangements or self._arrangements(())
-        poses = self._place(items, number, rng, arrangements)
-        if poses is not None:
-            return poses
-        if self.scene.spec.regions:
-            counts = Counter(self.scene.spec.region_names[item.region] for item in items if item.pose is None)
-            raise InputError(
-                f"{self.scene.path}: regions must be large enough to hold all objects of a layout without overlap "
-                f"(got {', '.join(f'{count} objects in {name}' for name, count in counts.items())})"
-            )
-        size = np.subtract(region.max, region.min)
-        raise InputError(
-            f"{self.scene.path}: region must be large enough to hold all objects of a layout without overlap "
-            f"(got {len(assets)} objects in {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} m"
-            f"{self._describe_obstruction(self.static_scenes[number].obstacles)}, "
-            f"settle.arrangement {arrangements[0]})"
-        )
-
-    def _place(
-        self, items: Sequence[Item], number: int, rng: np.random.Generator, arrangements: Sequence[Arrangement]
-    ) -> Float64Array | None:
-        settle = self.scene.spec.settle
-        regions = [
-            (region, arrangement)
-            for (region, _), arrangement in zip(self.scene.spec.all_regions, arrangements, strict=True)
-        ]
-        return draw_poses(items, self.static_scenes[number].obstacles, regions, rng, settle.yaw, settle.turned_over)
-
-    def _items(
-        self, assets: Sequence[int], given: Sequence[Float64Array | None], regions: Sequence[int] | None
-    ) -> list[Item]:
-        return [
-            Item(
-                asset,
-                self.objects[asset].surface,
-                self.objects[asset].body.outline,
-                given[i] if given else None,
-                regions[i] if regions else 0,
-            )
-            for i, asset in enumerate(assets)
-        ]
-
-    def _describe_obstruction(self, obstacles: Sequence[PlacedSurface]) -> str:
-        """Describe the obstacle that fills most of the region; empty if no obstacle fills a tenth of it."""
-        points = np.random.default_rng(0).uniform(self.scene.spec.region.min, self.scene.spec.region.max, (1000, 3))
-        taken = [float((item.signed_distances(points) < 0).mean()) for item in obstacles]
-        worst = int(np.argmax(taken))
-        return f", {taken[worst]:.0%} of which are inside {obstacles[worst].name!r}" if taken[worst] >= 0.1 else ""
-
-    def _placed(self, asset: int, pose: Float64Array) -> PlacedSurface:
-        return PlacedSurface(self.scene.assets[asset].name, self.objects[asset].surface, pose)
 
     def _instances(self, drawn: Sequence[_DrawnObject], poses: Float64Array) -> tuple[Instance, ...]:
         return tuple(

@@ -24,7 +24,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.physics.worlds import Body, World
+from mitsplat.physics.bodies import Body
+from mitsplat.physics.worlds import World
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 

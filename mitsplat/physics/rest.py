@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.physics.bodies import Body
 from mitsplat.physics.handling import NO_HANDLING, Handling
-from mitsplat.physics.worlds import Body, ContactOverflow, World
+from mitsplat.physics.worlds import ContactOverflow, World
 
 CONTACT_OVERFLOW = "contact buffer overflow"
 """Reason of :func:`run_to_rest` for rejecting a drop that may succeed with a larger capacity."""

@@ -44,6 +44,9 @@ MIN_IMPACT_SPEED = 0.1
 SIMULTANEOUS = 1e-5
 """Time between impacts of one pair of bodies that count as one [s]."""
 
+IMPACT_IMPEDANCE = 0.9999
+"""Impedance of impacts: the largest of MuJoCo, so that a contact reaches its reference acceleration."""
+
 
 def rebound_speed(
     restitution: Float64Array, approach: Float64Array, since: Float64Array, gravity: Float64Array, timestep: float

@@ -30,8 +30,8 @@ from mitsplat.storage.content_hash import ContentHash
 PACKAGE = Path(__file__).parents[1]
 
 _PHYSICS_MODULES = (
-    *("bodies", "certificate", "contacts", "drop", "friction", "handling", "placement", "rest", "restitution"),
-    *("static_scene", "worlds"),
+    *("bodies", "certificate", "contact_solver", "contacts", "drop", "friction", "handling", "mujoco_world"),
+    *("newton_model", "placement", "rest", "restitution", "start_poses", "static_scene", "warp_world", "worlds"),
 )
 MODULES = (
     "geometry.decomposition",

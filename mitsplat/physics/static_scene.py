@@ -12,9 +12,8 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.mesh import prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface, PlacedSurface
-from mitsplat.physics.bodies import make_collider
+from mitsplat.physics.bodies import Body, Collider, all_pieces, make_collider
 from mitsplat.physics.contacts import ContactFinder
-from mitsplat.physics.worlds import Body, Collider, all_pieces
 from mitsplat.progress import Note
 from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.scene import Scene

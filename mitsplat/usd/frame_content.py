@@ -13,9 +13,8 @@ from mitsplat.asset import Asset
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh import prepare_mesh
 from mitsplat.images.colour import decode_srgb
-from mitsplat.physics.bodies import make_body, make_collider
+from mitsplat.physics.bodies import Body, Collider, make_body, make_collider
 from mitsplat.physics.settle import settle_layout, warp_settings
-from mitsplat.physics.worlds import Body, Collider
 from mitsplat.progress import discard_note
 from mitsplat.renderer.textures import texture_image
 from mitsplat.runtime.variant import ensure_variant

@@ -25,11 +25,11 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.images.colour import encode_srgb
-from mitsplat.physics.bodies import make_body
+from mitsplat.physics.bodies import Body, make_body
 from mitsplat.physics.drop import TIMESTEP
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION, ContactMaterial
+from mitsplat.physics.newton_model import CONTACT_TIME, DAMPING_RATIO, IMPEDANCE_MUJOCO, WITH_ROLL
 from mitsplat.physics.settle import warp_settings
-from mitsplat.physics.worlds import CONTACT_TIME, DAMPING_RATIO, IMPEDANCE_MUJOCO, WITH_ROLL, Body
 from mitsplat.progress import discard_note
 from mitsplat.scene.scene import Scene
 from mitsplat.storage.files import storage_errors, write_file

@@ -27,10 +27,10 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL, homogeneous_matrix
 from mitsplat.images.colour import temperature_colour
-from mitsplat.physics.bodies import make_body
+from mitsplat.physics.bodies import Body, Collider, make_body
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION, ContactMaterial
+from mitsplat.physics.newton_model import CONTACT_DAMPING, CONTACT_STIFFNESS, IMPEDANCE_MUJOCO, WITH_ROLL
 from mitsplat.physics.settle import warp_settings
-from mitsplat.physics.worlds import CONTACT_DAMPING, CONTACT_STIFFNESS, IMPEDANCE_MUJOCO, WITH_ROLL, Body, Collider
 from mitsplat.progress import discard_note
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightSpec

@@ -34,7 +34,7 @@ def placed_clearances(scene, layout):
     from mitsplat.physics.drop import drop_of
 
     drop = drop_of(scene, lambda text: None)
-    placed = [drop._placed(instance.asset, instance.world_from_object) for instance in layout.instances]
+    placed = [drop.start_poses.placed(instance.asset, instance.world_from_object) for instance in layout.instances]
     return all_clearances(placed, [], reach=0.005)
 
 

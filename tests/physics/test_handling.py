@@ -119,8 +119,8 @@ def test_a_pushed_block_pushes_others():
 
 def test_a_block_between_the_plane_and_a_wall_is_left_behind():
     """The plane passes it without pressing it into the wall."""
+    from mitsplat.physics.bodies import Collider
     from mitsplat.physics.handling import Sweep
-    from mitsplat.physics.worlds import Collider
 
     wall = Collider(block().material, box=((0.02, 0.2, 0.1), pose_at((0.06, 0, 0.05))))  # its face is at x = 0.05
     world = world_of("mujoco", [block()], [table(), wall], [pose_at((0.02, 0, 0.01))])

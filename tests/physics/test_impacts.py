@@ -120,7 +120,8 @@ def test_the_restitution_of_an_underdamped_contact_equals_its_closed_form():
 @pytest.mark.parametrize("speed", [pytest.param(3.0, marks=pytest.mark.extended), 6.0])
 def test_a_thin_plate_does_not_tunnel(stepper, speed):
     """A plate of 2 mm moves 12 mm per step at 6 m/s, thrown flat, on edge and on a corner at table and wall."""
-    from mitsplat.physics.worlds import Collider, ContactMaterial
+    from mitsplat.physics.bodies import Collider
+    from mitsplat.physics.friction import ContactMaterial
 
     plate = trimesh.creation.box((0.05, 0.04, 0.002))
     wall = Collider(ContactMaterial(), box=((0.05, 1.0, 1.0), pose_at((0.425, 0, 0.5))))

@@ -59,7 +59,7 @@ def test_drawn_poses_are_uniform_and_do_not_overlap(scene_data, write_scene):
     for _ in range(300):
         poses = drop.draw_poses((0, 0, 1), rng)
         rotations.append(poses[:, :3, :3])
-        placed = [drop._placed(asset, pose) for asset, pose in zip((0, 0, 1), poses, strict=True)]
+        placed = [drop.start_poses.placed(asset, pose) for asset, pose in zip((0, 0, 1), poses, strict=True)]
         bounds = np.stack([item.bounds for item in placed])
         assert (bounds >= np.array(scene_data["region"]["min"]) - 1e-9).all()
         assert (bounds <= np.array(scene_data["region"]["max"]) + 1e-9).all()
@@ -274,12 +274,12 @@ def test_steppers_leave_upright_objects_at_the_same_poses(scene_data, write_scen
 def test_simulations_are_freed(scene_data, write_scene, monkeypatch):
     """Models in Newton's reference cycles are freed, however seldom Python's garbage collector runs."""
     from mitsplat.physics import drop
-    from mitsplat.physics import worlds as physics
+    from mitsplat.physics import mujoco_world as physics
     from mitsplat.physics.settle import warp_settings
 
     models = []
-    build = physics._build_model
-    monkeypatch.setattr(physics, "_build_model", lambda *args: (model := build(*args), models.append(ref(model)))[0])
+    build = physics.build_model
+    monkeypatch.setattr(physics, "build_model", lambda *args: (model := build(*args), models.append(ref(model)))[0])
     monkeypatch.setattr(drop, "_COLLECTION_INTERVAL", 2)
     gc.disable()
     try:

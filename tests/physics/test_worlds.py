@@ -16,21 +16,21 @@ def test_mujoco_makes_the_hulls_that_newton_analyses(monkeypatch):
     """The pieces of bodies and colliders give the same bytes of MuJoCo's model, as meshes and as convex hulls."""
     import mujoco
 
-    from mitsplat.physics import worlds
+    from mitsplat.physics import mujoco_world
+    from mitsplat.physics.bodies import Collider
+    from mitsplat.physics.friction import ContactMaterial
 
     def model_bytes():
-        model = worlds.MujocoWorld([body], [ground], timestep=0.002)._model
+        model = mujoco_world.MujocoWorld([body], [ground], timestep=0.002)._model
         found = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, found)
         return found.tobytes()
 
     body = body_of(trimesh.creation.icosphere(1, 0.02), trimesh.creation.box((0.05, 0.01, 0.01)))
-    ground, build = (
-        worlds.Collider(worlds.ContactMaterial(), (trimesh.creation.box((1.0, 1.0, 0.1)),)),
-        worlds._build_model,
-    )
+    ground = Collider(ContactMaterial(), (trimesh.creation.box((1.0, 1.0, 0.1)),))
+    build = mujoco_world.build_model
     as_meshes = model_bytes()
-    monkeypatch.setattr(worlds, "_build_model", lambda *args: build(*args[:3], True))
+    monkeypatch.setattr(mujoco_world, "build_model", lambda *args: build(*args[:3], True))
     assert model_bytes() == as_meshes
 
 
@@ -93,7 +93,7 @@ def test_stepping_mujoco_in_stages_changes_no_bit(monkeypatch):
     """With MuJoCo's friction, separate calls of the stages give the same bits as mj_step."""
     import mujoco
 
-    from mitsplat.physics import worlds as physics
+    from mitsplat.physics import mujoco_world as physics
 
     box = trimesh.creation.box((0.02, 0.03, 0.01))
     poses = [pose_at((0.004 * i, 0, 0.02 + 0.03 * i), Rotation.from_rotvec((i, 1, 0.3))) for i in range(5)]
@@ -122,8 +122,9 @@ def test_a_full_contact_buffer_is_an_error():
 
 def test_worlds_in_one_simulation_do_not_interact():
     """A world falls as it does alone while a second world with more pieces runs on the same kernels."""
+    from mitsplat.physics.bodies import all_pieces
     from mitsplat.physics.contacts import ContactFinder
-    from mitsplat.physics.worlds import WarpWorld, all_pieces
+    from mitsplat.physics.warp_world import WarpWorld
 
     few = [body_of(trimesh.creation.box((0.02, 0.03, 0.01)))] * 2
     many = [body_of(trimesh.creation.icosphere(subdivisions=1, radius=0.01))] * 6
@@ -196,8 +197,9 @@ def test_a_stack_of_five_drifts_by_less_than_a_tenth_of_a_millimetre(stepper):
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_a_ball_rests_inside_a_cup(stepper):
     """The floor of the cup is 6 mm thick: the ball's centre rests one radius above it, not above the rim."""
+    from mitsplat.physics.bodies import Collider
+    from mitsplat.physics.friction import ContactMaterial
     from mitsplat.physics.rest import run_to_rest
-    from mitsplat.physics.worlds import Collider, ContactMaterial
 
     wall = [(0.0275, (0.005, 0.06)), (-0.0275, (0.005, 0.06))]
     cup = [trimesh.creation.box((0.06, 0.06, 0.006)).apply_translation((0, 0, 0.003))]

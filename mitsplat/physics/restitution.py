@@ -31,12 +31,10 @@ one material have that material's coefficient, and nothing rebounds from a surfa
 
 from __future__ import annotations
 
-from typing import no_type_check
+from typing import Any
 
 import numpy as np
 import warp as wp
-
-from mitsplat.arrays import Float64Array
 
 MIN_IMPACT_SPEED = 0.1
 """Approach speed below which a contact is damped [m/s]."""
@@ -48,10 +46,10 @@ IMPACT_IMPEDANCE = 0.9999
 """Impedance of impacts: the largest of MuJoCo, so that a contact reaches its reference acceleration."""
 
 
-def rebound_speed(
-    restitution: Float64Array, approach: Float64Array, since: Float64Array, gravity: Float64Array, timestep: float
-) -> Float64Array:
-    """Compute the separation speeds of impacts [m/s], shape (N,); see :mod:`mitsplat.physics.restitution`.
+def rebound_speed(restitution: Any, approach: Any, since: Any, gravity: Any, timestep: Any) -> Any:
+    """Compute the separation speeds of impacts [m/s]; see :mod:`mitsplat.physics.restitution`.
+
+    The arguments are arrays of NumPy, shape (N,), or numbers of a kernel in :data:`rebound_speed_on_warp`.
 
     Args:
         restitution: Coefficients of the contacts.
@@ -60,14 +58,10 @@ def rebound_speed(
         gravity: Gravity along the normals [m/s^2].
         timestep: Timestep [s].
     """
-    half = gravity * (timestep + 2 * since) / 2
-    return np.sqrt(half**2 + restitution**2 * approach * (approach + gravity * (timestep - 2 * since))) - half
-
-
-@wp.func
-@no_type_check
-def rebound_speed_on_warp(restitution: float, approach: float, since: float, gravity: float, timestep: float):
-    """Compute :func:`rebound_speed` in a kernel."""
     half = 0.5 * gravity * (timestep + 2.0 * since)
     energy = restitution * restitution * approach * (approach + gravity * (timestep - 2.0 * since))
-    return wp.sqrt(half * half + energy) - half
+    return np.sqrt(half * half + energy) - half
+
+
+rebound_speed_on_warp = wp.func(rebound_speed)
+"""Function of a kernel that computes :func:`rebound_speed`."""

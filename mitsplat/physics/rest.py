@@ -36,8 +36,10 @@ _DRAG_TIME = 0.2  # time constant of the drag on bodies that still move after FR
 # Bodies are late if they roll or rock while the others rest: they move farther than bodies at rest may within the same
 # time. At least one body may be late, and at most this share of all.
 _MAX_LATE = 0.5
-# Time after the handling in which failed bodies start again [s], twice that of a typical pile of thirty packages.
-_REDRAW_TIME = 7.0
+# Time after the handling in which failed bodies start again [s], twice that of a typical pile of thirty packages. Late
+# bodies start again only once: a second failure, after 5 s at the earliest, shows a pile that creeps, and a new one
+# rests sooner.
+_REDRAW_TIME, _LATE_REDRAW_TIME = 7.0, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +99,8 @@ def run_to_rest(
     Bodies that still move after 1.5 s no longer rebound, and are slowed by a drag with a time constant of 0.2 s, which
     ends together with rolling friction. A body fails if it leaves the bounds or leans against a wall. It also fails if
     it still moves, or has moved for two seconds, after half of the bodies, or all but one, have moved by less than
-    0.5 mm for a second. With ``redraw``, bodies that fail in the first seven seconds start again from new poses, while
-    the others stay where they are. Otherwise, the drop is rejected.
+    0.5 mm for a second. With ``redraw``, bodies that fail in the first seven seconds, or four if they still move, start
+    again from new poses, while the others stay where they are. Otherwise, the drop is rejected.
 
     Args:
         world: Simulation; changed in place.
@@ -160,7 +162,7 @@ def _run_to_rest(
         if not failed.any() and since - begin >= max_time:
             reason, failed = f"not at rest within {max_time:g} s", moving
         if failed.any():
-            in_time = world.time < handling.end + _REDRAW_TIME
+            in_time = world.time < handling.end + (_LATE_REDRAW_TIME if reason == LATE else _REDRAW_TIME)
             drawn = redraw(poses, failed) if redraw is not None and in_time else None
             if drawn is None:
                 raise _Rejected(reason, failed)

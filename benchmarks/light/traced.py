@@ -72,7 +72,7 @@ def filtered(by_neighbours: bool) -> Iterator[None]:
 def reflected() -> Iterator[None]:
     """Return reflected light of many rays, without the mean over cells on meshes."""
     rays = patch.multiple(bounce, BOUNCE_RAYS=REFLECTED, CELL_RAYS=REFLECTED, MESH_RAYS=REFLECTED)
-    with rays, patch.object(LightFilter, "average", lambda _, values: values):
+    with rays, patch.object(LightFilter, "average", lambda _, values, radius=0: values):
         yield
 
 

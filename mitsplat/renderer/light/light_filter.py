@@ -21,8 +21,15 @@ WIDE_LOBE_SHARE = 2.0
 SAME_GLOSS = 0.1
 """Largest difference of roughness plus twice the metalness between neighbours whose reflections are averaged."""
 
-NOISE_LIMIT = 4.0
-"""Largest squared difference between the light shares of two neighbours that are averaged, in variances."""
+NOISE_LIMIT = 16.0
+"""Squared difference between the light shares of two neighbours, in variances, at which their weight reaches 0.
+
+The weight is Tukey's biweight (Beaton and Tukey 1974), which falls smoothly. A weight that falls in one step at a noisy
+difference gives adjacent pixels different windows, so that penumbrae get saw-teeth.
+"""
+
+SECOND_NOISE = 0.4
+"""Factor of the variance of light shares after the average along rows, for the average along columns."""
 
 GUESS_WEIGHT = 1e-3
 """Weight of a point that is not known to lie on a surface, relative to a known point."""
@@ -65,11 +72,12 @@ class _Traits:
 class LightFilter:
     """Separable edge-preserving filter at the pixels of an image where light was traced.
 
-    A neighbour counts if it belongs to the same shape, its normal agrees, it lies in the tangent plane, and noise
-    explains the difference of its light share. A hard shadow therefore keeps its edge, while a penumbra becomes smooth.
-    A few rays per pixel estimate the share too roughly, so share and variance are taken from 3 x 3 pixels. The variance
-    is that of n binary draws, where n is the effective sample size of the weighted rays (Kish 1965, section 11.7).
-    Equal sums stay equal, so that the ratio of an unshadowed point is exactly 1.
+    A neighbour counts if it belongs to the same shape, its normal agrees, and it lies in the tangent plane. Its weight
+    is larger if noise explains the difference of its light share. A hard shadow therefore keeps its edge, while a
+    penumbra becomes smooth. A few rays per pixel estimate the share too roughly, so share and variance are taken from
+    3 x 3 pixels. The variance is that of n binary draws, where n is the effective sample size of the weighted rays
+    (Kish 1965, section 11.7). The average along columns compares the shares averaged along rows, so that adjacent
+    columns have similar windows. Equal sums stay equal, so that the ratio of an unshadowed point is exactly 1.
 
     At a silhouette, a pixel may show one instance while its ray hits the proxy of another. Such a point takes its light
     from known neighbours that show the same instance.
@@ -234,20 +242,25 @@ class LightFilter:
     ) -> tuple[list[mi.Float], mi.Float]:
         """Return averages, and the effective number of equally weighted pixels with the same number of rays.
 
-        If ``share`` (light share and variance) is given, only neighbours whose share differs by no more than noise
-        count. If ``lobe`` (mirrored direction, smallest cosine between two of them, gloss) is given, only neighbours of
-        the same gloss that mirror similar directions count.
+        If ``share`` (light share and variance) is given, neighbours count as far as noise explains the difference of
+        their shares. If ``lobe`` (mirrored direction, smallest cosine between two of them, gloss) is given, only
+        neighbours of the same gloss that mirror similar directions count.
         """
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
         guide = [*(share or (0, 0)), *([] if lobe is None else [*lobe[0], lobe[2]])]
         traits = packed([*here.position, *here.normal, here.trait, known, rays, *guide])  # see _Traits
-        alike = mi.Float(1)
+        alike, count, noise = mi.Float(1), len(values), NOISE_LIMIT
+        values = values if share is None else [*values, share[0]]
         for direction in ((1, 0), (0, 1)):
-            values, along = self._average_along(values, traits, direction, radius, share, lobe)
+            values, along = self._average_along(values, traits, direction, radius, share, lobe, noise)
             alike *= along
             dr.eval(values, alike)
-        return values, alike
+            if share is not None:
+                share, noise = (values[count], share[1]), noise * SECOND_NOISE
+                row = dr.arange(mi.UInt32, dr.width(self.index)) * (dr.width(traits) // dr.width(self.index))
+                dr.scatter(traits, share[0], row + _Traits.SHARE)
+        return values[:count], alike
 
     def _average_along(
         self,
@@ -257,6 +270,7 @@ class LightFilter:
         radius: int,
         share: tuple[mi.Float, mi.Float] | None,
         lobe: tuple[mi.Vector3f, mi.Float, mi.Float] | None,
+        noise: float,
     ) -> tuple[list[mi.Float], mi.Float]:
         """Average over pixels up to ``radius`` away along a direction (x, y); the outermost pixels have half weight.
 
@@ -267,7 +281,7 @@ class LightFilter:
         along_x, along_y = (dr.opaque(mi.Int32, step) * self.stride for step in direction)
         images, columns = packed(values), dr.width(traits) // width
         own_rays = dr.gather(mi.ArrayXf, traits, dr.arange(mi.UInt32, width), shape=(columns, width))[_Traits.RAYS]
-        last = dr.opaque(mi.UInt32, radius)
+        last, limit = dr.opaque(mi.UInt32, radius), dr.opaque(mi.Float, noise)
 
         def add(
             step: mi.UInt32, weights: mi.Float, squares: mi.Float, *sums: mi.Float
@@ -284,18 +298,21 @@ class LightFilter:
             same &= trait == here.trait
             plane = dr.abs(dr.dot(here.normal, position - here.position))
             near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * mi.Float(8 * distance))
+            likely = mi.Float(1)
             if share is not None:
-                difference, variance = other[_Traits.SHARE] - share[0], share[1] + other[_Traits.VARIANCE]
-                near &= dr.square(difference) <= NOISE_LIMIT * variance
+                difference, variance = other[_Traits.SHARE] - share[0], limit * (share[1] + other[_Traits.VARIANCE])
+                likely = dr.square(dr.maximum(1 - dr.square(difference) / dr.maximum(variance, 1e-20), 0))
             if lobe is not None:
                 towards = mi.Vector3f(*other[_Traits.MIRRORED])
                 # Both are the cosine of unit vectors. The second one accepts equal mean directions of any length.
                 cosine = dr.dot(towards, lobe[0]) if share is None else 1 - dr.squared_norm(towards - lobe[0]) / 2
                 near &= cosine > lobe[1]
                 near &= dr.abs(other[_Traits.GLOSS] - lobe[2]) < SAME_GLOSS
-            same &= (near & (known == here.known)) | (known & ~here.known)
+            alike = near & (known == here.known)
+            same &= alike | (known & ~here.known)
             # With half weights at the ends, the filter spans exactly one period of the dither.
             weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(distance == last, mi.Float(0.5), 1.0)
+            weight *= dr.select(alike, likely, 1)
             squares += dr.select(same, weight * weight * rays, 0)
             weight = dr.select(same, weight * rays, 0)
             theirs = dr.gather(mi.ArrayXf, images, place, same, shape=(_padded(len(values)), width))

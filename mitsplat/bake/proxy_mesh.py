@@ -15,6 +15,8 @@ from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 
 _LABEL_GAP = 0.01
 """Maximum distance of a label sheet from its solid, relative to the size of the sheet."""
+_TOUCHING = 1e-6
+"""Tolerance of the simplification of the union of touching solids, relative to its size."""
 _TOLERANCES = 1e-5 * 1.5 ** np.arange(18)
 """Tolerances of simplification relative to the size, up to 0.01; tried in turn until the face count is low enough."""
 
@@ -29,14 +31,31 @@ def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
     solids = [mesh for mesh in meshes if mesh.is_volume]
     sheets = [mesh for mesh in meshes if not mesh.is_volume]
     if len(solids) > 1:
-        solids = [trimesh.boolean.union(solids, engine="manifold")]
+        solids = [_unite(solids)]
     if solids:
         sheets = [sheet for sheet in sheets if not _lies_on(sheet, solids[0])]
     sheets = [_retriangulate_flat(sheet) for sheet in sheets]
     face_budget = max(most_faces - sum(len(sheet.faces) for sheet in sheets), most_faces // 2)
     solids = [_simplify(solid, face_budget) for solid in solids]
-    proxy = trimesh.util.concatenate(solids + sheets)
-    return trimesh.Trimesh(proxy.vertices, proxy.faces)
+    return _merged(trimesh.util.concatenate(solids + sheets))
+
+
+def _unite(solids: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Unite solids.
+
+    Where solids touch, their union has vertices closer to each other than vertices of files are, which are merged. Four
+    faces can then share an edge. The union is simplified in this case, which leaves no such vertices.
+    """
+    union = trimesh.boolean.union(solids, engine="manifold")
+    if _merged(union).is_volume:
+        return union
+    simple = simplify_solid(union, tolerance=_TOUCHING * union.scale)
+    return simple if _merged(simple).is_volume else union
+
+
+def _merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a mesh whose equal vertices are merged."""
+    return trimesh.Trimesh(mesh.vertices, mesh.faces)
 
 
 def _simplify(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:

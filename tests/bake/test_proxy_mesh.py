@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import trimesh
 
 from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.geometry.mesh_distance import DistanceSurface
+
+
+def part(mesh: trimesh.Trimesh) -> MeshPart:
+    return MeshPart("part", mesh, np.full((len(mesh.faces), 3, 3), 0.5), None, 0.0, None, True, 0.04, ())
 
 
 def test_the_proxy_of_a_scan_with_many_faces_is_watertight() -> None:
@@ -16,9 +21,23 @@ def test_the_proxy_of_a_scan_with_many_faces_is_watertight() -> None:
     factors = 1 + 0.005 * np.random.default_rng(0).normal(size=(len(ball.vertices), 1))
     scan = trimesh.Trimesh(ball.vertices * factors, ball.faces, process=False)
     assert scan.is_volume and not scan.simplify_quadric_decimation(face_count=4000).is_volume
-    proxy = make_proxy(
-        [MeshPart("scan", scan, np.full((len(scan.faces), 3, 3), 0.5), None, 0.0, None, True, 0.04, ())], 4000
-    )
+    proxy = make_proxy([part(scan)], 4000)
     assert proxy.is_volume
     assert 1000 < len(proxy.faces) <= 4000
     assert np.abs(DistanceSurface(scan).signed_distances(proxy.sample(2000, seed=0))).max() < 0.01 * scan.scale
+
+
+@pytest.mark.parametrize("turn", [(-np.pi / 2, 0, 0), (0.3, -0.7, 1.1)])
+@pytest.mark.parametrize("sections", [80, 48, 37])
+def test_touching_solids_form_a_closed_proxy(sections: int, turn: tuple[float, float, float]) -> None:
+    """A knob of two parts. Its rotation rounds the positions of the faces in which the cap and the shaft touch."""
+    outline = [(0, 0), (0.016, 0), (0.018, 0.003), (0.018, 0.018), (0.014, 0.022), (0, 0.022)]
+    cap = trimesh.creation.revolve(outline, sections=sections)
+    shaft = trimesh.creation.cylinder(0.004, 0.03, sections=48)
+    shaft.apply_translation((0, 0, -0.015))
+    for mesh in (cap, shaft):
+        mesh.apply_transform(trimesh.transformations.compose_matrix(angles=turn))
+    proxy = make_proxy([part(cap), part(shaft)], 10000)
+    assert proxy.is_volume
+    assert proxy.volume == pytest.approx(cap.volume + shaft.volume, rel=1e-6)
+    assert proxy.extents == pytest.approx(trimesh.util.concatenate([cap, shaft]).extents, rel=1e-5)

@@ -41,7 +41,7 @@ class FitResult:
         seconds: Duration of the steps, over all runs [s].
         held_out: Quality on photos that affected neither the fit nor its end.
         inputs: SHA-256 of photos, masks, depth maps, cameras, points, settings and version.
-        warnings: Sentences on inputs that could not be used.
+        warnings: Sentences on inputs that could not be used, and on a budget that allowed few steps.
         validation: Quality on photos that were not fitted, and whose PSNR decided the end of the fit; empty without a
             target.
     """

@@ -136,6 +136,8 @@ class FitProgress:
 
 _REPORT_STEPS = 25
 """Steps between reports; reading a loss waits for the device."""
+_ENOUGH_STEPS = 0.5
+"""Least share of the stated steps that a time limit should allow; a warning states a smaller one."""
 _MAX_READERS = 16
 """Largest number of photos that are read in parallel.
 
@@ -206,10 +208,16 @@ def fit_capture(
     held = [_training_view(photo, settings) for photo in held_out]
     folder.start(resumed=state is not None)
     _run_steps(fit, folder, progress)
+    seconds = fit.elapsed
+    if settings.budget is not None and seconds >= settings.budget and fit.steps < settings.iterations * _ENOUGH_STEPS:
+        warnings += (
+            f"the budget of {settings.budget:g} s allowed only {fit.steps} of {settings.iterations} steps; a longer "
+            "fit is sharper",
+        )
     result = FitResult(
         splats=fit.model.splats(),
         iterations=fit.steps,
-        seconds=fit.elapsed,
+        seconds=seconds,
         held_out=fit.evaluate(held, folder.held_out),
         inputs=folder.inputs,
         warnings=warnings,

@@ -234,6 +234,12 @@ def test_a_fit_ends_within_its_time_limit(capture: Capture, tmp_path: Path, monk
     monkeypatch.setattr(fit.time, "monotonic", lambda: 0.01 * next(now))
     short = fit_capture(capture, tmp_path, replace(SMALL, iterations=10**6, budget=2.0))
     assert short.seconds == pytest.approx(2, abs=0.05) and 20 < short.iterations < 200
+    (warning,) = short.warnings
+    assert warning == f"the budget of 2 s allowed only {short.iterations} of 1000000 steps; a longer fit is sharper"
+    again = fit_capture(capture, tmp_path, replace(SMALL, iterations=10**6, budget=2.0))
+    assert again.warnings == short.warnings
+    enough = fit_capture(capture, tmp_path / "enough", replace(SMALL, iterations=20, budget=1e4))
+    assert enough.iterations == 20 and enough.warnings == ()
     assert short.validation == ()
 
 

@@ -18,6 +18,7 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.capture.pipeline.capture_result import CaptureResult
 from mitsplat.errors import InputError
+from mitsplat.fit.fit_folder import FitResult
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
@@ -292,8 +293,11 @@ def test_photos_become_an_asset_through_all_stages(
     """A fit of other inputs is replaced without a prompt, see test_fit_interrupted.py."""
     overwritten = []
 
-    def fit_capture(capture: object, out: Path, settings: FitSettings, *, overwrite: bool, progress: object) -> None:
+    def fit_capture(
+        capture: object, out: Path, settings: FitSettings, *, overwrite: bool, progress: object
+    ) -> FitResult:
         overwritten.append(overwrite)
+        return FitResult(known_object.splats, 5, 60.0, (), "", ("the fit was short",))
 
     def made_of(found: Capture, fit: Path, out: Path, job: AssetJob, **_: object) -> AssetResult:
         assert (found, fit) == (capture, out / "fit")
@@ -310,7 +314,7 @@ def test_photos_become_an_asset_through_all_stages(
     for settings in (FitSettings(), FitSettings(), FitSettings(iterations=5)):
         made = asset_from_photos(tmp_path, tmp_path / "asset", job, capture=CaptureSettings(), fit=settings)
     assert made.folder == tmp_path / "asset"
-    assert made.warnings == captured.warnings
+    assert made.warnings == (*captured.warnings, "the fit was short")
     assert "05.png (60%)" in made.warnings[0]
     assert overwritten == [True, True, True]
 

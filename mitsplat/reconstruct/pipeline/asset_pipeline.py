@@ -44,7 +44,7 @@ class AssetResult:
         folder: Folder of the asset.
         verdict: Quality figures.
         kept: True if an earlier run made the asset from the same inputs.
-        warnings: Warnings on the photographs, one sentence each.
+        warnings: Warnings on the photographs and the fit, one sentence each.
         scene: File of an example scene with the asset, if one was written.
     """
 
@@ -95,9 +95,9 @@ def asset_from_photos(
             done = int(now.fraction * fit.iterations)
             progress(done, fit.iterations, f"fitting: {now.psnr:.1f} dB, {now.gaussians} Gaussians")
 
-    fit_capture(taken.capture, out / "fit", fit, overwrite=True, progress=fitting)
+    fitted = fit_capture(taken.capture, out / "fit", fit, overwrite=True, progress=fitting)
     done = make_asset(taken.capture, out / "fit", out, job, source=taken.source, progress=progress)
-    return replace(done, warnings=(*taken.warnings, *done.warnings))
+    return replace(done, warnings=(*taken.warnings, *fitted.warnings, *done.warnings))
 
 
 def default_fit(kind: Literal["object", "environment"]) -> FitSettings:

@@ -30,7 +30,7 @@ _HOME = {
     "BakeSettings": "bake.bake",
     "Camera": "geometry.camera",
     "Capture": "capture.capture",
-    "CaptureSettings": "capture.pipeline.capture_pipeline",
+    "CaptureSettings": "capture.pipeline.capture_settings",
     "FitSettings": "fit.trainer",
     "Frame": "frames.frame",
     "ImportSettings": "importing.splat_import",
@@ -76,8 +76,8 @@ if TYPE_CHECKING:
     from mitsplat.bake.bake import BakeSettings as BakeSettings
     from mitsplat.bake.bake import bake_asset as bake_asset
     from mitsplat.capture.capture import Capture as Capture
-    from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings as CaptureSettings
     from mitsplat.capture.pipeline.capture_pipeline import capture_photos as capture_photos
+    from mitsplat.capture.pipeline.capture_settings import CaptureSettings as CaptureSettings
     from mitsplat.dataset.python_frames import write_frames as write_frames
     from mitsplat.dataset.rerender import rerender_frame as rerender_frame
     from mitsplat.dataset.write import write_dataset as write_dataset

@@ -273,7 +273,8 @@ def captured(
     photos: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path, CaptureResult]:
     """Capture the rendered photos with one truncated photo among them, and return photos, folder and result."""
-    from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+    from mitsplat.capture.pipeline.capture_pipeline import capture_photos
+    from mitsplat.capture.pipeline.capture_settings import CaptureSettings
     from tests import rendered
 
     def make(folder: Path) -> None:

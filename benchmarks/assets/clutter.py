@@ -31,7 +31,7 @@ from benchmarks.assets.photographing import by_name, paint, photograph, show_whe
 from benchmarks.record import recording
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo, known_where
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL

@@ -30,7 +30,7 @@ from benchmarks.record import figure, recording
 from mitsplat.capture.alignment.target_evidence import fit_similarity
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera

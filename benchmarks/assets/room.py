@@ -30,7 +30,8 @@ from benchmarks.assets.judged import on_truth, tell_wanted
 from benchmarks.assets.known import BOARD
 from benchmarks.assets.photographing import by_name, paint, photograph
 from benchmarks.record import cpu_seconds, figure, recording
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import capture_photos
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.trainer import FitSettings, fit_capture
 from mitsplat.geometry.camera import Camera

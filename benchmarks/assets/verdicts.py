@@ -33,7 +33,7 @@ from benchmarks.assets.known import BOARD, chamfer, solid, speckled, table_scene
 from benchmarks.assets.photographing import by_name, photograph, show_where
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.trainer import FitSettings
 from mitsplat.geometry.camera import Camera

@@ -8,7 +8,8 @@ and masks of the object.
 from __future__ import annotations
 
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import capture_photos
 from mitsplat.capture.pipeline.capture_result import CaptureResult
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 
 __all__ = ["Capture", "CaptureResult", "CaptureSettings", "Photo", "capture_photos"]

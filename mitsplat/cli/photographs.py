@@ -31,7 +31,7 @@ from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
     from mitsplat.capture.boards.targets import Board
-    from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
+    from mitsplat.capture.pipeline.capture_settings import CaptureSettings
     from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; an object needs masks.")]
@@ -410,7 +410,7 @@ def _capture_settings(
     box: Box,
 ) -> CaptureSettings:
     """Return the capture settings from the options that `capture` and `asset` share."""
-    from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
+    from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 
     return CaptureSettings(
         kind=kind,

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array, Float64Array, Int32Array
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.triangulation import nearest_point_to_lines, optical_axes
 
 Mask = Float32Array
 
@@ -67,14 +68,8 @@ def _random_points(cameras: Sequence[Camera], masks: Sequence[Mask] | None, rng:
 
     A point belongs to the hull if it is inside at least 90 % of the largest number of masks that share a point.
     """
-    centres = np.array([camera.centre for camera in cameras])
-    axes = np.array([camera.world_from_camera[:3, 2] for camera in cameras])
-    # The focus is the point nearest to all optical axes. A small weight on the mean camera centre defines it for
-    # parallel axes.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    weight = 1e-3 * len(centres)
-    normal = across.sum(axis=0) + weight * np.eye(3)
-    focus = np.linalg.solve(normal, np.einsum("nij,nj->i", across, centres) + weight * centres.mean(axis=0))
+    centres, axes = optical_axes(cameras)
+    focus = nearest_point_to_lines(centres, axes, pull=1e-3 * len(centres))
     reach = float(np.median(np.linalg.norm(centres - focus, axis=1))) or 1.0
     ball = rng.normal(size=(_RANDOM_POINTS if masks is None else _HULL_CANDIDATES, 3))
     ball *= rng.random((len(ball), 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)

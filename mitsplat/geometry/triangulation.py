@@ -51,10 +51,26 @@ def count_observers(seen: Iterable[Int32Array], count: int) -> Int64Array:
     return counts
 
 
-def nearest_point_to_lines(origins: Float64Array, directions: Float64Array) -> Float64Array:
-    """Return the point (3,) nearest to all lines through ``origins`` (N, 3) along unit ``directions`` (N, 3)."""
+def optical_axes(cameras: Iterable[Camera]) -> tuple[Float64Array, Float64Array]:
+    """Return the centres (N, 3) and the viewing directions (N, 3) of cameras."""
+    poses = np.array([camera.world_from_camera for camera in cameras])
+    return poses[:, :3, 3], poses[:, :3, 2]
+
+
+def nearest_point_to_lines(
+    origins: Float64Array, directions: Float64Array, *, weights: Float64Array | None = None, pull: float = 1e-9
+) -> Float64Array:
+    """Return the point (3,) nearest to all lines.
+
+    Args:
+        origins: Points on the lines, shape (N, 3).
+        directions: Unit vectors along the lines, shape (N, 3).
+        weights: Weights of the lines, shape (N,); 1 by default.
+        pull: Weight of the mean origin, which defines the point nearest to parallel lines.
+    """
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    # A small multiple of the identity regularises the case of parallel lines, which have no unique nearest point.
-    normal_matrix = across.sum(axis=0) + 1e-9 * np.eye(3)
-    right_side = np.einsum("nij,nj->i", across, origins) + 1e-9 * origins.mean(axis=0)
+    if weights is not None:
+        across = weights[:, None, None] * across
+    normal_matrix = across.sum(axis=0) + pull * np.eye(3)
+    right_side = np.einsum("nij,nj->i", across, origins) + pull * np.average(origins, axis=0, weights=weights)
     return np.asarray(np.linalg.solve(normal_matrix, right_side))

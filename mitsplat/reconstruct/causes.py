@@ -10,7 +10,7 @@ import numpy as np
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.capture.capture import Capture
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.triangulation import nearest_point_to_lines
+from mitsplat.geometry.triangulation import nearest_point_to_lines, optical_axes
 
 Pictures = Sequence[tuple[Camera, Float32Array, Float32Array | None]]
 """Camera, colours (H, W, 3) and mask (H, W) of each photo, all with the same longest edge."""
@@ -105,8 +105,7 @@ def blurred_photos(names: Sequence[str], pictures: Pictures) -> list[str]:
 
 def views_from(cameras: Sequence[Camera]) -> Float64Array:
     """Return camera centres (N, 3) relative to the point nearest to all optical axes."""
-    centres = np.array([camera.centre for camera in cameras])
-    axes = np.array([camera.world_from_camera[:3, 2] for camera in cameras])
+    centres, axes = optical_axes(cameras)
     return np.asarray(centres - nearest_point_to_lines(centres, axes))
 
 

@@ -19,7 +19,7 @@ from mitsplat.capture.capture import Capture
 from mitsplat.fit.image_metrics import psnr
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.rigid import homogeneous_matrix
-from mitsplat.geometry.triangulation import nearest_point_to_lines
+from mitsplat.geometry.triangulation import nearest_point_to_lines, optical_axes
 from mitsplat.pages.html import make_section, rgb_image
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, show_asset
@@ -263,9 +263,8 @@ def _typical_depth(capture: Capture) -> float:
 
 def _background(place: _PhotographedPlace) -> BoolArray:
     """Return True for Gaussians (N,) in the background."""
-    cameras = [photo.camera for photo in place.capture.training]
-    centres = np.array([camera.centre for camera in cameras])
-    focus = nearest_point_to_lines(centres, np.array([camera.world_from_camera[:3, 2] for camera in cameras]))
+    centres, axes = optical_axes(photo.camera for photo in place.capture.training)
+    focus = nearest_point_to_lines(centres, axes)
     away = float(np.quantile(np.linalg.norm(centres - focus, axis=1), 0.9))
     return np.asarray(np.linalg.norm(place.splats.means - focus, axis=1) > _FOREGROUND_DISTANCE * away)
 

@@ -25,8 +25,9 @@ from mitsplat.capture.alignment.target_evidence import fit_similarity
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.photos import Prepared
 from mitsplat.capture.pipeline import capture_pipeline as take
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import capture_photos
 from mitsplat.capture.pipeline.capture_result import CaptureResult
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.camera import Camera

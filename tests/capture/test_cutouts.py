@@ -15,7 +15,8 @@ from mitsplat.capture import known_poses as poses
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.photo_masks import add_masks, check_borders, cutout_masks, given_masks
 from mitsplat.capture.photos import Prepared, plain_background, prepare_photos
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import capture_photos
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera

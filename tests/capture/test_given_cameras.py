@@ -23,8 +23,9 @@ from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.nerf_transforms import parse_transforms, read_transforms
 from mitsplat.capture.photos import Prepared, mask_files, prepare_photos, read_mask, with_orientation
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import capture_photos
 from mitsplat.capture.pipeline.capture_result import CaptureResult
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from tests import rendered

@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image
 
 from mitsplat.capture.known_poses import unnamed_photos
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import capture_photos
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 
 
 def write_split(folder: Path, named: int, *, pictures: int = 4) -> CaptureSettings:

@@ -13,7 +13,7 @@ import pytest
 
 from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.cli.console import stage_bar
 from mitsplat.errors import InputError
 from mitsplat.fit import depth_network as depth_model

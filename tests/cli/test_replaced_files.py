@@ -11,7 +11,8 @@ import pytest
 
 from mitsplat.asset import Asset
 from mitsplat.capture.lighting import refuse_to_replace
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import capture_photos
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.capture.video import choose_frames
 from mitsplat.errors import InputError, MissingResourceError, exit_status
 from mitsplat.fit.fit_folder import FitFolder

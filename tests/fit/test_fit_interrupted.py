@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.capture.pipeline.capture_result import CaptureResult
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit import fit_folder
 from mitsplat.fit import trainer as fit

@@ -15,8 +15,8 @@ import trimesh
 
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings
 from mitsplat.capture.pipeline.capture_result import CaptureResult
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.fit_folder import FitResult
 from mitsplat.fit.trainer import FitSettings

@@ -20,7 +20,7 @@ from mitsplat.capture.capture import parse_pixel
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
 from mitsplat.geometry.rigid import homogeneous_matrix
-from mitsplat.geometry.triangulation import count_observers, nearest_point_to_lines
+from mitsplat.geometry.triangulation import count_observers, nearest_point_to_lines, optical_axes
 
 DEFAULT_BOARD = Board()
 """Default board of `mitsplat board`."""
@@ -93,7 +93,7 @@ def find_metric_frame(
         evidence = FrameEvidence() if scale_from is None else _distance_evidence(model, scale_from)
     scale, board_pose = evidence.scale, evidence.board
     plane = evidence.plane or find_table(model)
-    centres, forward = _rays(model)
+    centres, forward = optical_axes(model.cameras.values())
     target = origin = nearest_point_to_lines(centres, forward)
     if plane is not None:
         normal, point = plane
@@ -186,7 +186,7 @@ def find_table(model: SparseModel) -> tuple[Float64Array, Float64Array] | None:
     points = model.points[_reliable_points(model)]
     if len(points) < 50:
         return None
-    centres, forward = _rays(model)
+    centres, forward = optical_axes(model.cameras.values())
     distance = float(np.median(np.linalg.norm(centres - nearest_point_to_lines(centres, forward), axis=1)))
     tolerance = 0.004 * distance
     upward = vertical_from_cameras(model)
@@ -243,12 +243,6 @@ def vertical_from_cameras(model: SparseModel) -> Float64Array | None:
     if tilt[best] > 0.03 or others.min() < 3 * tilt[best] + 0.01:  # arbitrary roll, or all from one side
         return None
     return np.asarray(upward * np.sign(np.mean(-poses[:, :, 2] @ upward)))
-
-
-def _rays(model: SparseModel) -> tuple[Float64Array, Float64Array]:
-    """Return centres and viewing directions of the cameras, shape (N, 3) each."""
-    poses = np.array([camera.world_from_camera for camera in model.cameras.values()])
-    return poses[:, :3, 3], poses[:, :3, 2]
 
 
 def _reliable_points(model: SparseModel) -> npt.NDArray[np.intp]:

@@ -17,7 +17,7 @@ from mitsplat.capture.isolation.support import SupportSurface, find_support
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.clusters import cluster_points, gap_between
-from mitsplat.geometry.triangulation import count_observers
+from mitsplat.geometry.triangulation import count_observers, nearest_point_to_lines, optical_axes
 
 _MAX_DISTANCE = 0.7
 """Maximum distance of considered points from the focus, as a fraction of the cameras' distance."""
@@ -149,15 +149,11 @@ def focus_of(cameras: Sequence[Camera]) -> tuple[Float64Array, float]:
 
     The point is found by iteratively reweighted least squares. Axes far from the point have low weights (Cauchy).
     """
-    centres = np.array([camera.centre for camera in cameras])
-    axes = np.array([camera.world_from_camera[:3, 2] for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    weights, focus = np.ones(len(cameras)), centres.mean(axis=0)
+    centres, axes = optical_axes(cameras)
+    weights, focus = np.ones(len(centres)), centres.mean(axis=0)
     for _ in range(20):
-        system = np.einsum("n,nij->ij", weights, across) + 1e-6 * weights.sum() * np.eye(3)
-        right = np.einsum("n,nij,nj->i", weights, across, centres) + 1e-6 * weights @ centres
-        focus = np.linalg.solve(system, right)
-        gaps = np.linalg.norm(np.einsum("nij,nj->ni", across, focus - centres), axis=1)
+        focus = nearest_point_to_lines(centres, axes, weights=weights, pull=1e-6 * float(weights.sum()))
+        gaps = np.linalg.norm(np.cross(axes, focus - centres), axis=1)
         weights = 1 / (1 + (gaps / max(1.5 * float(np.median(gaps)), 1e-9)) ** 2)
     return focus, float(np.median(np.linalg.norm(centres - focus, axis=1)))
 

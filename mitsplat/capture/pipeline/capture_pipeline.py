@@ -5,18 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from mitsplat.arguments import check_fields, check_type, path_of
+from mitsplat.arguments import check_type, path_of
 from mitsplat.arrays import BoolArray
-from mitsplat.capture.alignment.metric_frame import DEFAULT_BOARD, MetricFrame, find_metric_frame
+from mitsplat.capture.alignment.metric_frame import MetricFrame, find_metric_frame
 from mitsplat.capture.boards.board_mask import bare_squares
-from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import CAPTURE_FILE, Capture, Photo
 from mitsplat.capture.exposure import even_exposure
 from mitsplat.capture.geometric_masks import object_masks, object_points
@@ -26,6 +24,7 @@ from mitsplat.capture.nerf_transforms import check_metric
 from mitsplat.capture.photo_masks import add_masks, check_borders, cutout_masks, given_masks, model_masks, plain_masks
 from mitsplat.capture.photos import SUFFIXES, Prepared, find_photos, prepare_photos, undistort
 from mitsplat.capture.pipeline.capture_result import CaptureResult
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.capture.pipeline.overview import capture_sheet
 from mitsplat.capture.pipeline.picking import chosen_object
 from mitsplat.capture.structure_from_motion import MIN_AGREEMENT, MIN_POINTS, SURE_AGREEMENT, SparseModel, find_cameras
@@ -50,77 +49,10 @@ _RESULT_FIELDS = ("source", "reprojection_error", "doubtful", "unnamed")
 """Fields of a result that ``inputs.json`` stores in addition to the inputs."""
 
 
-@dataclass(frozen=True)
-class CaptureSettings:
-    """Settings of a capture.
-
-    Attributes:
-        kind: ``object`` is segmented by masks; ``environment`` is not.
-        max_size: Longest edge of the photos [px]; larger photos are reduced.
-        frames: Maximum number of frames taken from a video.
-        board: ChArUco board to detect.
-        tag: Edge length of printed AprilTags [m]; None if unknown.
-        scale_from: Two points and their distance [m], as in :func:`mitsplat.capture.alignment.metric_frame.spot`.
-        poses: COLMAP model or ``transforms.json`` with given cameras.
-        metric: True if ``poses`` are in metres with z up; they are then not transformed.
-        masks: Folder of masks.
-        mask_model: ONNX file of a segmentation network.
-        undistorted: Resample the photos to pinhole cameras.
-        picks: Pixels on the object, PHOTO:X,Y in pixels of the capture's photos. Without picks, the object is the one
-            at which the photos are directed.
-        picks_not: Pixels on other objects.
-        box: Minimum and maximum x, y and z of a box that contains the object, in the frame of the capture.
-    """
-
-    kind: Literal["object", "environment"] = "object"
-    max_size: int = 1600
-    frames: int = 150
-    board: Board = DEFAULT_BOARD
-    tag: float | None = None
-    scale_from: tuple[str, str, float] | None = None
-    poses: Path | None = None
-    metric: bool = False
-    masks: Path | None = None
-    mask_model: Path | None = None
-    undistorted: bool = False
-    picks: tuple[str, ...] = ()
-    picks_not: tuple[str, ...] = ()
-    box: tuple[float, float, float, float, float, float] | None = None
-
-    @property
-    def has_hints(self) -> bool:
-        """True if picks or a box indicate the object."""
-        return bool(self.picks or self.picks_not or self.box)
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        rules = (
-            (self.max_size < 64, f"the size of photos must be at least 64 px (got {self.max_size})"),
-            (self.tag is not None and not self.tag > 0, f"the edge of tags must be > 0 m (got {self.tag})"),
-            (self.metric and self.poses is None, "--metric requires --poses"),
-            (
-                self.masks is not None and self.mask_model is not None,
-                "--masks and --mask-model both define the masks: give only one",
-            ),
-            (
-                self.has_hints and not (self.kind == "object" and self.masks is None and self.mask_model is None),
-                "--pick, --pick-not and --box select an object to segment: remove them with --masks, --mask-model or "
-                "an environment",
-            ),
-            (
-                self.box is not None and not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)),
-                f"a box must be X0 Y0 Z0 X1 Y1 Z1, each X0 < X1, Y0 < Y1, Z0 < Z1 (got {self.box})",
-            ),
-        )
-        for broken, rule in rules:
-            if broken:
-                raise InputError(rule)
-
-
 def capture_photos(
     photos: str | Path,
     out: str | Path,
-    settings: CaptureSettings = CaptureSettings(),
+    settings: CaptureSettings | None = None,
     *,
     progress: Progress | None = None,
 ) -> CaptureResult:
@@ -132,7 +64,7 @@ def capture_photos(
         photos: Folder of photographs of one object or place, or a video file.
         out: Capture folder. ``sfm/`` in it holds intermediate results for later runs, ``frames/`` the frames of a
             video.
-        settings: Settings of the capture.
+        settings: Settings of the capture; by default those of :class:`CaptureSettings`.
         progress: Callback with the steps done, their total and the present activity.
 
     Raises:
@@ -141,6 +73,7 @@ def capture_photos(
         MissingResourceError: If COLMAP or the mask network fails to run.
     """
     photos, out = path_of(photos, "photos"), path_of(out, "out")
+    settings = CaptureSettings() if settings is None else settings
     check_type(settings, CaptureSettings, "settings", "for example mitsplat.CaptureSettings(max_size=1200)")
     _check_outputs(out, photos, settings)
     if settings.masks is not None and not settings.masks.is_dir():

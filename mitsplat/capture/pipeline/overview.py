@@ -9,6 +9,7 @@ from PIL import Image
 
 from mitsplat.arrays import Float64Array
 from mitsplat.capture.capture import Capture
+from mitsplat.geometry.triangulation import optical_axes
 
 _PANEL = 640
 _COLUMNS = 8
@@ -19,8 +20,7 @@ _TINT = np.array([0.33, 0.0, 0.33], dtype=np.float32)
 
 def capture_sheet(capture: Capture) -> Image.Image:
     """Draw the overview picture of a capture, in RGB."""
-    centres = np.array([photo.camera.centre for photo in capture.photos])
-    ahead = np.array([photo.camera.world_from_camera[:3, 2] for photo in capture.photos])
+    centres, ahead = optical_axes(photo.camera for photo in capture.photos)
     reach = 1.1 * float(np.abs(centres).max())
     panels = []
     for axes, down in (((0, 1), 2), ((0, 2), 1)):

@@ -17,7 +17,8 @@ from typing import Literal
 from mitsplat.arguments import check_type, path_of
 from mitsplat.asset import ASSET_FILE, read_spec
 from mitsplat.capture.capture import Capture
-from mitsplat.capture.pipeline.capture_pipeline import CaptureSettings, capture_photos
+from mitsplat.capture.pipeline.capture_pipeline import capture_photos
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.fit_folder import FIT_FILE, read_record
 from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture

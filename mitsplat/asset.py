@@ -33,22 +33,23 @@ from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.mesh import check_faces
 from mitsplat.geometry.rigid import homogeneous_matrix, transform_points
-from mitsplat.geometry.untrusted_meshes import check_mesh
-from mitsplat.mesh_files.mesh_file import MeshFrame
-from mitsplat.mesh_files.mesh_reading import SCENE_SUFFIXES, read_surface
-from mitsplat.storage.field_types import Name
+from mitsplat.mesh_files.mesh_reading import read_mesh
+from mitsplat.storage.field_types import Name, Positive
 from mitsplat.storage.file_kinds import no_folder_with
-from mitsplat.storage.files import MESH_ERRORS, resolve_inside, storage_errors
+from mitsplat.storage.files import resolve_inside, storage_errors
 from mitsplat.storage.format_version import FORMAT_VERSIONS
 from mitsplat.storage.yaml_input import FieldError, key_place, load_yaml
 
-Positive = Annotated[float, Field(gt=0)]
 Length = Annotated[float, Field(ge=1e-9, le=1e9)]
 """Positive length. The bounds keep its cube within the range of a float32."""
 
 ASSET_FILE = "asset.yaml"
+COMMON_KEYS = (
+    *("name", "kind", "mass", "friction", "restitution", "rolling_friction", "torsional_friction"),
+    *("roughness", "specular", "capture_light", "white"),
+)
+"""Keys with the same value in :class:`AssetSpec` and :class:`Asset`."""
 _Z_UP_FROM = {
     "x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
     "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
@@ -200,23 +201,13 @@ class Asset:
         else:
             mesh = read_mesh(_named_file(folder, "mesh", spec.mesh))
         asset = cls(
-            name=spec.name,
+            **{key: getattr(spec, key) for key in COMMON_KEYS},
             class_name=spec.class_name or spec.name,
             splats=splats,
             mesh=mesh,
             pieces=() if spec.pieces is None else _read_pieces(_named_file(folder, "pieces", spec.pieces)),
-            kind=spec.kind,
             density=1000.0 if spec.density is None else spec.density,
-            mass=spec.mass,
-            friction=spec.friction,
-            restitution=spec.restitution,
-            rolling_friction=spec.rolling_friction,
-            torsional_friction=spec.torsional_friction,
-            roughness=spec.roughness,
-            specular=spec.specular,
-            capture_light=spec.capture_light,
             keypoints=spec.keypoints or {},
-            white=spec.white,
             units="unknown" if spec.units == "unknown" and spec.size is None else "metre",
             folder=folder,
         )
@@ -242,25 +233,15 @@ class Asset:
         try:
             spec = AssetSpec(
                 format_version=FORMAT_VERSIONS[ASSET_FILE],
-                name=self.name,
+                **{key: getattr(self, key) for key in COMMON_KEYS},
                 class_name=self.class_name,
-                kind=self.kind,
                 splats=splats,
                 materials=None if self.splats.materials is None else "materials.ply",
                 mesh=None if self.mesh is None else "mesh.ply",
                 pieces="pieces.ply" if self.pieces else None,
                 units=units if self.units == "metre" else "unknown",
                 density=self.density if self.mass is None else None,
-                mass=self.mass,
-                friction=self.friction,
-                restitution=self.restitution,
-                rolling_friction=self.rolling_friction,
-                torsional_friction=self.torsional_friction,
-                roughness=self.roughness,
-                specular=self.specular,
-                capture_light=self.capture_light,
                 keypoints=dict(stored.keypoints) or None,
-                white=self.white,
             )
         except ValidationError as error:
             first = error.errors()[0]
@@ -383,43 +364,6 @@ def read_spec(folder: str | PathLike[str]) -> AssetSpec:
     if not os.path.lexists(path):
         raise no_folder_with(Path(folder), ASSET_FILE, "an asset folder")
     return load_yaml(path, AssetSpec, newest=FORMAT_VERSIONS[ASSET_FILE])
-
-
-def read_mesh(path: Path, *, merge: bool = True, frame: MeshFrame | None = None) -> trimesh.Trimesh:
-    """Read a mesh file of any format; several parts become one mesh.
-
-    Args:
-        path: The file.
-        merge: Merge vertices at the same position. Without merging, an STL is never watertight.
-        frame: Convert to metres with z up; by default, the mesh has the units and axes of the file.
-
-    Raises:
-        InputError: If the file is missing or damaged, has no triangles, or has a vertex that is not finite.
-    """
-    if path.suffix.lower() in SCENE_SUFFIXES or (frame is not None and path.suffix.lower() == ".dae"):
-        mesh = read_surface(path, merge=merge, frame=frame)
-    else:
-        mesh = _read_with_trimesh(path, merge=merge)
-        if frame is not None and isinstance(mesh, trimesh.Trimesh):
-            mesh.apply_transform(frame.to_world())
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError(f"{path}: a mesh must have triangles (got none)")
-    check_faces(mesh, path)
-    if not np.isfinite(mesh.vertices).all():
-        row = int(np.argmin(np.isfinite(mesh.vertices).all(axis=1)))
-        raise InputError(f"{path}: vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")
-    return mesh
-
-
-def _read_with_trimesh(path: Path, *, merge: bool) -> trimesh.Trimesh:
-    check_mesh(path)
-    try:
-        with np.errstate(all="ignore"):
-            return trimesh.load_mesh(path, process=merge)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except MESH_ERRORS as error:
-        raise InputError(f"{path}: not a valid mesh file ({type(error).__name__}: {error})") from error
 
 
 def _named_file(folder: Path, key: str, name: str) -> Path:

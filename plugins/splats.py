@@ -9,11 +9,12 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
+from mitsplat.asset import ASSET_FILE, Asset, read_spec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import specular_of
 from mitsplat.geometry.rigid import split_similarity
+from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.renderer.materials.proxy_materials import GlossChange
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance

@@ -9,10 +9,11 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mitsplat.asset import Asset, read_mesh
+from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.mesh_files.mesh_reading import read_mesh
 
 DATA = Path(__file__).parents[2] / "shared/data/splats"
 SIZE = (0.06, 0.04, 0.02)

@@ -15,7 +15,7 @@ import trimesh
 from benchmarks.scale.attack.__main__ import all_attacks
 from benchmarks.scale.attack.attack import SECRET_COLOUR, SECRET_WORD, Attack, judge
 from benchmarks.scale.attack.samples import Place, Samples
-from mitsplat.asset import Asset, read_mesh
+from mitsplat.asset import Asset
 from mitsplat.bake.mesh_parts import read_parts
 from mitsplat.engine import scheduler
 from mitsplat.errors import InputError
@@ -23,6 +23,7 @@ from mitsplat.frames import mitsuba_xml as xml_scene
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry import untrusted_meshes
+from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.cli.typed import run
 from tests.conftest import box_asset

@@ -33,7 +33,7 @@ import trimesh
 from PIL import Image
 
 from benchmarks.record import figure, recording
-from mitsplat.asset import Asset, read_mesh
+from mitsplat.asset import Asset
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.photo_masks import given_masks
 from mitsplat.capture.photos import Prepared
@@ -45,6 +45,7 @@ from mitsplat.errors import InputError
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.scene.loading.scene_loading import load_scene
 
 MEMORY = 12 << 30

@@ -16,7 +16,6 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
 from mitsplat.arrays import Float64Array
-from mitsplat.asset import read_mesh
 from mitsplat.audit.dataset_check import (
     DatasetCheck,
     EntryCursor,
@@ -33,6 +32,7 @@ from mitsplat.audit.expected_files import labelled_assets
 from mitsplat.errors import InputError
 from mitsplat.images.masks import Box
 from mitsplat.images.picture_files import read_picture
+from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.storage.files import JsonObject
 from mitsplat.storage.json_stream import read_entries
 

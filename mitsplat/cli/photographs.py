@@ -314,8 +314,8 @@ def mesh(
     report.html shows the result. An environment is kept whole, and its level surfaces are detected. The exit status is
     4 if a quality threshold is missed.
     """
-    from mitsplat.asset import read_mesh
     from mitsplat.capture.capture import Capture
+    from mitsplat.mesh_files.mesh_reading import read_mesh
     from mitsplat.reconstruct.materials.capture_light import CaptureLight
     from mitsplat.reconstruct.pipeline.asset_pipeline import make_asset
     from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, ReconstructSettings

@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.geometry.mesh import check_faces
 from mitsplat.geometry.untrusted_meshes import check_mesh, refuse_archive, try_read
 from mitsplat.mesh_files.gltf import read_gltf
 from mitsplat.mesh_files.mesh_file import MeshFile, MeshFrame
@@ -24,17 +25,46 @@ SCENE_SUFFIXES = (".glb", ".gltf", ".3mf", *STEP_SUFFIXES)
 _READERS = {".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf}
 
 
-def read_surface(path: Path, *, merge: bool = True, frame: MeshFrame | None = None) -> trimesh.Trimesh:
-    """Read the geometry of a mesh file as one mesh.
+def read_mesh(path: Path, *, merge: bool = True, frame: MeshFrame | None = None) -> trimesh.Trimesh:
+    """Read a mesh file of any format; several parts become one mesh.
 
     Args:
         path: The file.
-        merge: Merge vertices at the same position.
+        merge: Merge vertices at the same position. Without merging, an STL is never watertight.
         frame: Convert to metres with z up; by default, the mesh has the units and axes of the file.
 
     Raises:
-        InputError, MissingResourceError: As :func:`read_mesh_file`.
+        InputError: If the file is missing or damaged, has no triangles, or has a vertex that is not finite.
+        MissingResourceError: If the package that reads such files is not installed.
     """
+    if path.suffix.lower() in SCENE_SUFFIXES or (frame is not None and path.suffix.lower() == ".dae"):
+        mesh = _read_surface(path, merge=merge, frame=frame)
+    else:
+        mesh = _read_with_trimesh(path, merge=merge)
+        if frame is not None and isinstance(mesh, trimesh.Trimesh):
+            mesh.apply_transform(frame.to_world())
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{path}: a mesh must have triangles (got none)")
+    check_faces(mesh, path)
+    if not np.isfinite(mesh.vertices).all():
+        row = int(np.argmin(np.isfinite(mesh.vertices).all(axis=1)))
+        raise InputError(f"{path}: vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")
+    return mesh
+
+
+def _read_with_trimesh(path: Path, *, merge: bool) -> trimesh.Trimesh:
+    check_mesh(path)
+    try:
+        with np.errstate(all="ignore"):
+            return trimesh.load_mesh(path, process=merge)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except MESH_ERRORS as error:
+        raise InputError(f"{path}: not a valid mesh file ({type(error).__name__}: {error})") from error
+
+
+def _read_surface(path: Path, *, merge: bool, frame: MeshFrame | None) -> trimesh.Trimesh:
+    """Read the geometry of a file of nodes and components as one mesh, see :func:`read_mesh`."""
     meshes, file = [], read_mesh_file(path, textures=False)
     for part in file.parts:
         mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)

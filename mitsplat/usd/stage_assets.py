@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from scipy.spatial import QhullError
 
 from mitsplat.arrays import Float32Array, Float64Array
-from mitsplat.asset import Asset, AssetSpec
+from mitsplat.asset import COMMON_KEYS, Asset, AssetSpec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import encode_sh
 from mitsplat.gaussians.splat_cloud import Splats
@@ -208,8 +208,8 @@ def make_stage_asset(path: Path, records: Record, body: str | None, splats: Spla
 
 def _checked(path: Path, asset: Asset) -> Asset:
     """Check the values of an asset by the rules of its file."""
-    names = ("name", "class_name", "kind", "mass", "density", "friction", "restitution", "capture_light", "keypoints")
-    values = {name: getattr(asset, name) for name in (*names, *_STATED)} | {"splats": "-", "mesh": "-"}
+    names = (*COMMON_KEYS, "class_name", "density", "keypoints")
+    values = {name: getattr(asset, name) for name in names} | {"splats": "-", "mesh": "-"}
     if asset.mass is not None:
         del values["density"]
     try:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsplat.asset import read_mesh
 from mitsplat.bake.mesh_parts import MeshPart, read_model, read_parts
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.images.colour import encode_srgb
+from mitsplat.mesh_files.mesh_reading import read_mesh
 from tests.mesh_files.glb import CORNER_UV, CORNERS, QUAD, SIZE, Glb, coordinate_image, cube_mesh, matt, sheet
 
 pytestmark = pytest.mark.usefixtures("without_trial")

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from skimage.measure import marching_cubes
 
 from benchmarks.assets.known import chamfer
-from mitsplat.asset import read_mesh
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh import prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface
+from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.reconstruct.registration import invert_transform, measure_offset, register_mesh, surface_points
 from mitsplat.reconstruct.surface import SurfaceSettings, _close_voids, reconstruct_surface, simplify_surface
 from tests.conftest import KnownObject

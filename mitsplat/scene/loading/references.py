@@ -13,10 +13,11 @@ from typing import Literal
 
 import trimesh
 
-from mitsplat.asset import ASSET_FILE, Asset, read_mesh, read_spec
+from mitsplat.asset import ASSET_FILE, Asset, read_spec
 from mitsplat.errors import InputError
 from mitsplat.images.untrusted_images import check_images
 from mitsplat.mesh_files.mesh_file import MeshFrame
+from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.scene.loading.image_lists import WILDCARDS, glob_below, image_names, names_below
 from mitsplat.scene.loading.primitives import make_primitives
 from mitsplat.scene.spec.light_spec import EnvironmentLight

@@ -26,7 +26,7 @@ import mitsplat as ms
 from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.dataset.dataset_folder import Shard
+from mitsplat.dataset.shard_file import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.formats.registry import Catalogue, write_frame
 from mitsplat.runtime.device import current_device

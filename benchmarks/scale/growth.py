@@ -26,7 +26,7 @@ from benchmarks.figures import read_results
 from benchmarks.record import figure, recording
 from benchmarks.scale import projection
 from benchmarks.scale.faults import SCENE
-from mitsplat.dataset.dataset_folder import Shard
+from mitsplat.dataset.shard_file import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
 from mitsplat.engine.ray import Cluster

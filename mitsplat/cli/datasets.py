@@ -152,7 +152,7 @@ def render(
             )
             _render_stage(scene, out, frames, overrides, device=device or "cpu", overwrite=overwrite)
             return
-        from mitsplat.dataset.dataset_folder import Shard
+        from mitsplat.dataset.shard_file import Shard
         from mitsplat.dataset.write import write_dataset
         from mitsplat.engine.ray import Cluster
         from mitsplat.scene.loading.scene_loading import load_scene

@@ -6,10 +6,10 @@ shards and resumed runs. Scenes that would produce no labels are refused before 
 
 from __future__ import annotations
 
-from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.folds import Fold, write_folds
 from mitsplat.dataset.python_frames import write_frames
 from mitsplat.dataset.rerender import RerenderedFrame, rerender_frame
+from mitsplat.dataset.shard_file import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import DatasetSummary, write_dataset
 

@@ -15,13 +15,11 @@ import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
-from pydantic import BaseModel, ConfigDict
 from ruamel.yaml import YAML
 
 from mitsplat.dataset.contact_sheet import ContactSheet
@@ -41,6 +39,7 @@ from mitsplat.dataset.dataset_files import (
 from mitsplat.dataset.inputs import describe_inputs
 from mitsplat.dataset.records.manifest import Manifest, append_line, remove_incomplete_line
 from mitsplat.dataset.records.record_schema import check_record
+from mitsplat.dataset.shard_file import describe_shard, read_shard
 from mitsplat.errors import InputError, PartialResultError
 from mitsplat.formats.registry import Catalogue, CollectionWriter
 from mitsplat.storage.files import (
@@ -64,67 +63,6 @@ DEFAULT_CONTENT = {FORMAT_VERSION: 1, "device": "cpu"}
 """Default values of keys that are absent in ``dataset.json``."""
 _MAX_LOCK_TEXT = 200
 """Maximum number of characters of a lock file that an error message shows."""
-
-
-@dataclass(frozen=True)
-class Shard:
-    """One of several separately rendered parts of a dataset.
-
-    Attributes:
-        number: Number of the shard, starting at 1.
-        count: Number of all shards.
-
-    Raises:
-        InputError: If ``number`` is not in 1 to ``count``.
-    """
-
-    number: int
-    count: int
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.number <= self.count:
-            raise InputError(f"a shard must be I/N with I from 1 to N (got {self.number}/{self.count})")
-
-    @classmethod
-    def parse(cls, text: str) -> Shard:
-        """Parse a shard from a text such as ``2/8``."""
-        number, _, count = text.partition("/")
-        if not (number.isdecimal() and count.isdecimal()):
-            raise InputError(f"a shard must be I/N, such as 2/8 (got {text})")
-        return cls(int(number), int(count))
-
-    def frames(self, total: int, views: int) -> range:
-        """Return the contiguous range of frames of this shard.
-
-        The range contains whole layouts of ``views`` frames if there are at least as many layouts as shards.
-
-        Args:
-            total: Number of frames of the whole dataset.
-            views: Number of frames per layout.
-
-        Raises:
-            InputError: If there are fewer frames than shards.
-        """
-        if self.count > total:
-            raise InputError(f"there must not be more shards than frames, {total} (got {self.count})")
-        layouts = -(-total // views)
-        unit, units = (views, layouts) if layouts >= self.count else (1, total)
-        first, last = (unit * (units * part // self.count) for part in (self.number - 1, self.number))
-        return range(first, min(last, total))
-
-    def to_json(self, total: int) -> dict[str, int]:
-        """Return the content of ``shard.json`` for this shard of a dataset of ``total`` frames."""
-        return {"shard": self.number, "of": self.count, "frames": total}
-
-
-class _StoredShard(BaseModel):
-    """Content of ``shard.json``."""
-
-    model_config = ConfigDict(strict=True)
-
-    shard: int
-    of: int
-    frames: int
 
 
 @contextmanager
@@ -319,31 +257,6 @@ def _check_resumable(
     if stored != shard:
         change = f"it was {describe_shard(stored)} and is {describe_shard(shard)}"
         raise InputError(f"{out}: cannot be resumed: {change}: overwrite it or choose another folder")
-
-
-def describe_shard(part: dict[str, int] | None) -> str:
-    """Return the content of ``shard.json`` in words."""
-    return f"shard {part['shard']}/{part['of']} of {part['frames']} images" if part else "a whole dataset"
-
-
-def read_shard(out: Path) -> dict[str, int] | None:
-    """Read ``shard.json``; return None for a whole dataset.
-
-    Raises:
-        InputError: If the file is damaged.
-    """
-    path = out / SHARD
-    try:
-        stored = _StoredShard.model_validate(read_json(path))
-        Shard(stored.shard, stored.of).frames(stored.frames, 1)
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: must state the shard, the number of shards and the number "
-            f"of frames ({' '.join(str(error).split())})"
-        ) from error
-    return stored.model_dump()
 
 
 def _prepare(out: Path, scene_file: Path, content: JsonObject, shard: dict[str, int] | None) -> None:

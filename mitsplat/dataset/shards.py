@@ -12,15 +12,14 @@ from pathlib import Path
 from mitsplat.dataset.dataset_files import CONTENT, RUNS, TIMINGS
 from mitsplat.dataset.dataset_folder import (
     DEFAULT_CONTENT,
-    describe_shard,
     finish_folder,
     first_difference,
     open_finished,
     open_folder,
-    read_shard,
 )
 from mitsplat.dataset.records.manifest import Manifest, read_lines
 from mitsplat.dataset.records.record_schema import read_content
+from mitsplat.dataset.shard_file import describe_shard, read_shard
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import Catalogue

@@ -30,10 +30,11 @@ from pathlib import Path
 
 from mitsplat.arguments import check_whole_number, path_of
 from mitsplat.dataset.dataset_files import SHEET, TIMINGS, layout_file, remove_folds
-from mitsplat.dataset.dataset_folder import Shard, append_run, content_of, finish_folder, open_folder
+from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.frame_job import FrameJob, RemoteFrameJob, Render, Settle, layout_errors
 from mitsplat.dataset.preflight import refuse, run_faults
 from mitsplat.dataset.records.manifest import append_line
+from mitsplat.dataset.shard_file import Shard
 from mitsplat.engine.pool import check_workers, run_frames
 from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
 from mitsplat.engine.resources import TYPICAL_MEMORY

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import mitsplat
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.dataset.dataset_folder import Shard
+from mitsplat.dataset.shard_file import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
 from mitsplat.formats import bop, coco, colmap, map_files, maps, yolo

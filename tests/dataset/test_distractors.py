@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset import frame_job
-from mitsplat.dataset.dataset_folder import Shard
+from mitsplat.dataset.shard_file import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
 from mitsplat.formats.registry import write_frame

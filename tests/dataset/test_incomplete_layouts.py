@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from mitsplat.audit.audit import audit_dataset
-from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.records.manifest import encode_line, parse_line
 from mitsplat.dataset.rerender import rerender_frame
+from mitsplat.dataset.shard_file import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import DatasetSummary, write_dataset
 from mitsplat.errors import InputError

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.folds import write_folds
 from mitsplat.dataset.rerender import rerender_frame
+from mitsplat.dataset.shard_file import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.dataset.write import write_dataset
 from mitsplat.engine.ray import Cluster

@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mitsplat.dataset.dataset_folder import Shard
 from mitsplat.dataset.frame_job import FrameJob, RemoteFrameJob
 from mitsplat.dataset.records.manifest import Manifest, encode_line
+from mitsplat.dataset.shard_file import Shard
 from mitsplat.dataset.shards import merge_shards
 from mitsplat.engine import ray as cluster
 from mitsplat.engine.answers import LostWorkersError

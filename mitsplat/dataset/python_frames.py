@@ -18,6 +18,7 @@ from mitsplat.frames.frame import Frame
 from mitsplat.frames.sequence import with_successor
 from mitsplat.runtime.device import current_device
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.scene_spec import Output
 from mitsplat.scene.splits import split_of
 from mitsplat.storage.files import storage_errors, write_text
 
@@ -69,18 +70,11 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
                 raise InputError(
                     f"frame {index}: must be of the scene's {output.width}x{output.height} px (got {width}x{height})"
                 )
-            split = split_of(index, output)
-            # The camera's pose and lens contain all drawn values except the motion.
-            motion = {name: value for name, value in frame.plan.viewpoint.items() if name == "motion"}
             is_film = following is not None and _leads_to(frame, following)
-            next_camera = frame.plan.next_camera if is_film else None
-            plan = replace(
-                frame.plan, index=index, layout=index, view=0, split=split, next_camera=next_camera, viewpoint=motion
-            )
-            layout = replace(frame.layout, index=index)
+            numbered = _numbered(frame, index, output, is_film=is_film)
             with storage_errors(out):
-                write_text(out / layout_file(index), json.dumps(layout.to_json()))
-                record = write_frame(replace(frame, plan=plan), out, scene.spec, catalogue, custom_layout=True)
+                write_text(out / layout_file(index), json.dumps(numbered.layout.to_json()))
+                record = write_frame(numbered, out, scene.spec, catalogue, original=frame)
                 if is_film:
                     record["next"] = index + 1
             append_line(out / TIMINGS, {"index": index, **{k: round(v, 4) for k, v in frame.seconds.items()}})
@@ -89,6 +83,21 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
             raise InputError("frames must have at least one frame (got none)")
         finish_folder(out, manifest, content, catalogue, counts.add)
         return counts.summary(out, rendered=len(manifest))
+
+
+def _numbered(frame: Frame, index: int, output: Output, *, is_film: bool) -> Frame:
+    """Return a frame with the plan of the only view of layout ``index``."""
+    plan = replace(
+        frame.plan,
+        index=index,
+        layout=index,
+        view=0,
+        split=split_of(index, output),
+        next_camera=frame.plan.next_camera if is_film else None,
+        # The camera's pose and lens contain all drawn values except the motion.
+        viewpoint={name: value for name, value in frame.plan.viewpoint.items() if name == "motion"},
+    )
+    return replace(frame, plan=plan, layout=replace(frame.layout, index=index))
 
 
 def _leads_to(frame: Frame, following: Frame) -> bool:

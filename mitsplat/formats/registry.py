@@ -63,12 +63,15 @@ TABLE = {
 
 
 def write_frame(
-    frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue, *, custom_layout: bool = False
+    frame: Frame, root: Path, spec: SceneSpec, catalogue: Catalogue, *, original: Frame | None = None
 ) -> Record:
     """Write the files of one frame below ``root``, and return its manifest record, which lists the files.
 
-    With a ``custom_layout`` of the caller, the record contains no values that are drawn together with a layout.
+    If ``frame`` is the numbered copy of an ``original`` that the caller rendered, the surroundings are those of the
+    original, and the record contains no values that are drawn together with a layout.
     """
+    custom_layout = original is not None
+    rendered = original or frame
     plan, output = frame.plan, spec.output
     ids = frame.instance if spec.labels.source == "splats" else frame.layers.proxy_instance
     if distractors := [instance.id for instance in frame.layout.instances if instance.class_index is None]:
@@ -103,7 +106,7 @@ def write_frame(
         record["viewpoint"] = dict(plan.viewpoint)
     if plan.belt is not None and not custom_layout:
         record["conveyor"] = {"time": plan.belt.time}
-    if place := draw_surroundings(spec, frame.index, frame.layout.index).to_json(spec):
+    if place := draw_surroundings(spec, rendered.index, rendered.layout.index).to_json(spec):
         record["place"] = place
     if any(entry.appearance for entry in spec.objects):
         record["appearance"] = [one.to_json() for one in frame.appearances.values()]

@@ -105,6 +105,20 @@ def test_the_order_of_frames_does_not_change_them(places: SceneData, write_scene
     np.testing.assert_array_equal(forth, back)
 
 
+def test_given_frames_keep_the_surroundings_in_which_they_were_rendered(
+    places: SceneData, write_scene: WriteScene, tmp_path: Path
+) -> None:
+    """A frame gets a new number in a dataset made in Python, but the manifest records what its picture shows."""
+    scene = ms.load_scene(write_scene(places))
+    with ms.Renderer(scene) as renderer:
+        frames = [renderer.render(index, layout=lying(scene, index // 2)) for index in (7, 5)]
+    records = records_of(ms.write_frames(scene, tmp_path / "out", frames).path)
+    for record, frame in zip(records, frames, strict=True):
+        place = draw_surroundings(scene.spec, frame.index)
+        assert record["place"] == json.loads(json.dumps(place.to_json(scene.spec)))
+    assert list(audit_dataset(tmp_path / "out").violations) == []
+
+
 def test_a_dataset_with_drawn_environments_has_no_violations(
     places: SceneData, write_scene: WriteScene, tmp_path: Path
 ) -> None:

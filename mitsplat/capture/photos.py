@@ -41,7 +41,6 @@ both directions and stay above it.
 _MAX_CLIPPED = 0.9
 """Fraction of black or white pixels above which a photo is unusable; a white backdrop covers less."""
 
-
 _MIN_BRIGHTEST = 20
 """Minimum grey value of the brightest pixel of a photo [of 255]. 12-bit values in a file of 16 bits are at most 15."""
 
@@ -209,21 +208,25 @@ def _prepare(
         write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", **options))
     focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)
     lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
-    grey = np.asarray(rgb.convert("L"))
-    alpha, shown, opaque = alpha_channel(turned), np.ones(grey.shape, bool), None
+    alpha, shown, opaque = alpha_channel(turned), np.ones(rgb.size[::-1], bool), None
     if alpha is not None:
         shown = np.asarray(alpha.resize(rgb.size, Image.Resampling.BOX)) >= 128
         opaque = float(shown.mean())
         if not opaque:
             return "it is transparent"
     prepared = Prepared(name, file, rgb.size, orientation, tuple(map(str, lens)), pending, opaque)
-    regions = [shown]
-    if not upright and (plain := plain_background(np.asarray(rgb))) is not None:
-        regions.append(shown & ~plain)
-    is_cutout = not regions[-1].all()
-    sharp = sharpness(grey, regions[-1] if is_cutout else None)
-    if (mask := read_mask(masks, prepared)) is not None:
-        regions.append(shown & mask)
+    plain = None if upright else plain_background(np.asarray(rgb))
+    return _measure(prepared, np.asarray(rgb.convert("L")), shown, plain, read_mask(masks, prepared))
+
+
+def _measure(
+    prepared: Prepared, grey: ByteImage, shown: BoolArray, plain: BoolArray | None, mask: BoolArray | None
+) -> _MeasuredPhoto:
+    """Measure the quality of a photo by its opaque pixels (``shown``), plain background and mask of the object."""
+    foreground = shown if plain is None else shown & ~plain
+    is_cutout = not foreground.all()
+    sharp = sharpness(grey, foreground if is_cutout else None)
+    regions = [shown, foreground] if mask is None else [shown, foreground, shown & mask]
     clipped = [(float(np.mean(grey[r] <= 4)), float(np.mean(grey[r] >= 251))) for r in regions if r.any()]
     return _MeasuredPhoto(prepared, sharp, is_cutout, min(clipped, key=max), int(grey[shown].max()))
 

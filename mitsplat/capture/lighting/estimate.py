@@ -175,20 +175,11 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
         exposures = exposures_of(photographs, view.exposures)
         pixels, focal = [photograph.pixels for photograph in photographs], photographs[0].focal
     picture = min(pixels, key=lambda levels: abs(float(levels.mean()) - _MEAN_LEVEL))
-    ball = find_ball(*pixels) if view.ball is None else view.ball
-    if ball is None:
-        raise InputError(f"{paths[0]}: no ball was detected: give --ball X Y RADIUS")
-    x, y, radius = ball
     height, width = picture.shape[:2]
-    if min(x, y, width - x, height - y) < radius:
-        raise InputError(
-            f"{paths[0]}: the ball must be completely visible in the photograph, {width} x {height} px (got radius "
-            f"{radius:.0f} around {x:.0f}, {y:.0f})"
-        )
-    if radius < _MIN_RADIUS:
-        raise InputError(f"{paths[0]}: the ball's radius must be {_MIN_RADIUS:g} px or more (got {radius:.0f})")
+    ball = _checked_ball(paths[0], find_ball(*pixels) if view.ball is None else view.ball, width, height)
     clipped = np.zeros((height, width), bool)
     if not hdr:
+        x, y, radius = ball
         part = tuple(slice(max(0, int(middle - radius) - 1), int(middle + radius) + 2) for middle in (y, x))
         image = np.zeros((height, width, 3), np.float32)
         image[part], clipped[part] = merge_exposures([levels[part] for levels in pixels], exposures)
@@ -211,6 +202,21 @@ def read_ball(paths: Sequence[Path], view: BallView) -> BallReading:
             "lamps there is a lower bound"
         )
     return BallReading(found, ball, _draw_circle(picture, ball), warnings)
+
+
+def _checked_ball(path: Path, ball: Circle | None, width: int, height: int) -> Circle:
+    """Return the ball if it is large enough and completely visible in a photograph of ``width`` x ``height`` px."""
+    if ball is None:
+        raise InputError(f"{path}: no ball was detected: give --ball X Y RADIUS")
+    x, y, radius = ball
+    if min(x, y, width - x, height - y) < radius:
+        raise InputError(
+            f"{path}: the ball must be completely visible in the photograph, {width} x {height} px (got radius "
+            f"{radius:.0f} around {x:.0f}, {y:.0f})"
+        )
+    if radius < _MIN_RADIUS:
+        raise InputError(f"{path}: the ball's radius must be {_MIN_RADIUS:g} px or more (got {radius:.0f})")
+    return ball
 
 
 def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None = None) -> list[Path]:

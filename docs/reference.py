@@ -1,17 +1,20 @@
-"""Writes the tables of ``scene.md`` and ``cli.md`` from the code: ``python docs/reference.py [--check]``.
+"""Writes the generated parts of pages: ``python docs/reference.py [--check]``.
 
-The tables are between two comments of each page. ``--check`` writes nothing, and exits with status 1 if a page differs
-from the code.
+These are the scene keys, the commands, the gallery and the example scripts. The part of a page is below its comment.
+``--check`` writes nothing, and exits with status 1 if a page differs from the code.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
+import inspect
 import re
 import sys
 from pathlib import Path
 
 from cli_reference import cli_reference
+from pictures import GALLERY, SCENES, SHEETS
 from scene_reference import scene_reference
 
 from mitsplat.scene import scene_json_schema
@@ -21,10 +24,43 @@ _BEGIN = "<!-- Written by python docs/reference.py from here on -->\n\n"
 _PART = re.compile(f"(?<={re.escape(_BEGIN)}).*", re.DOTALL)
 
 
+def gallery() -> str:
+    """Return a section for each scene of the gallery, with its pictures; the site adds the files."""
+    sections = []
+    for name in (*GALLERY, "real.yaml", "mirror_ball.xml"):
+        stem = Path(name).stem
+        comment = re.match(r"(?:# .*\n)+|<!-- .* -->", (SCENES / name).read_text())
+        text = re.sub(r"^# |^<!-- | -->$", "", comment[0] if comment else "", flags=re.MULTILINE).strip()
+        parts = [f"## {stem.replace('_', ' ').capitalize()}", text]
+        parts.append(f"File: [`scenes/{name}`](../scenes/{name})")
+        if name != "real.yaml":
+            parts.append(f"![A frame of {name}](pictures/scene/gallery-{stem}.jpg)")
+        if name in SHEETS:
+            parts.append(f"![Frames of {name}](pictures/scene/sheet-{stem}.jpg)")
+        sections.append("\n\n".join([*parts, f"<!-- included: scenes/{name} -->"]))
+    return "\n\n".join(sections)
+
+
+def scripts() -> str:
+    """Return a section for each script of the examples, with its docstring; the site adds the files."""
+    sections = []
+    for path in sorted((SCENES.parent / "examples").glob("*.py")):
+        text = inspect.cleandoc(ast.get_docstring(ast.parse(path.read_text())) or "").replace("``", "`")
+        link = f"File: [`examples/{path.name}`](../examples/{path.name})"
+        sections.append(f"### `{path.name}`\n\n{text}\n\n{link}\n\n<!-- included: examples/{path.name} -->")
+    return "\n\n".join(sections)
+
+
 def reference_pages() -> dict[Path, str]:
     """Return the expected text of each page."""
-    parts = {DOCS / "scene.md": scene_reference(scene_json_schema()), DOCS / "cli.md": cli_reference()}
-    return {page: _PART.sub(lambda _, part=part: f"{part}\n", page.read_text()) for page, part in parts.items()}
+    parts = {
+        "scene.md": scene_reference(scene_json_schema()),
+        "cli.md": cli_reference(),
+        "gallery.md": gallery(),
+        "examples.md": scripts(),
+    }
+    texts = {DOCS / name: (DOCS / name).read_text() for name in parts}
+    return {page: _PART.sub(lambda _, name=page.name: f"{parts[name]}\n", text) for page, text in texts.items()}
 
 
 def stale_pages() -> list[str]:

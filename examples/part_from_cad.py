@@ -1,6 +1,8 @@
 """Make an asset from a part that is modelled in code, drop it into a tray, and render labelled images.
 
-python examples/part_from_cad.py [FOLDER]
+    python examples/part_from_cad.py [FOLDER]
+
+The asset, the scene and the images are written to FOLDER, by default a temporary folder.
 """
 
 import sys

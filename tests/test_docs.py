@@ -163,7 +163,7 @@ def test_every_command_option_and_scene_key_is_in_a_row_of_the_reference_pages()
 def test_a_page_that_differs_from_the_code_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import reference
 
-    for name in ("scene.md", "cli.md"):
+    for name in ("scene.md", "cli.md", "gallery.md", "examples.md"):
         (tmp_path / name).write_text((DOCS / name).read_text())
     monkeypatch.setattr(reference, "DOCS", tmp_path)
     assert reference.stale_pages() == []

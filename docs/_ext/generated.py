@@ -1,4 +1,4 @@
-"""Fills in what is generated: a page says where by a comment such as ``<!-- generated: gallery -->``.
+"""Fills in what is generated: a page says where by a comment such as ``<!-- generated: api -->``.
 
 So the pages stay readable where nothing is built, and what they say of the code cannot be out of date.
 """
@@ -15,7 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from docutils import nodes
-from pictures import GALLERY, SCENES, SHEETS
 from sphinx.application import Sphinx
 from sphinx.domains.python import PyObject
 
@@ -49,29 +48,10 @@ PACKAGES = (
 )
 
 
-def _gallery() -> str:
-    sections = []
-    for name in (*GALLERY, "real.yaml", "mirror_ball.xml"):
-        path = SCENES / name
-        first = path.read_text().split("\n", 1)[0]
-        told, language = re.sub(r"^# |^<!-- | -->$", "", first), "xml" if path.suffix == ".xml" else "yaml"
-        title = path.stem.replace("_", " ").capitalize()
-        frame = f"![A frame of {name}](pictures/scene/gallery-{path.stem}.jpg)\n\n" if name != "real.yaml" else ""
-        sheet = f"![Frames of {name}](pictures/scene/sheet-{path.stem}.jpg)\n\n" if name in SHEETS else ""
-        sections.append(
-            f"## {title}\n\n{told}\n\n{frame}{sheet}"
-            f"```{{literalinclude}} ../scenes/{name}\n:language: {language}\n:caption: scenes/{name}\n```"
-        )
-    return "\n\n".join(sections)
-
-
-def _scripts() -> str:
-    sections = []
-    for path in sorted((ROOT / "examples").glob("*.py")):
-        told = inspect.cleandoc(ast.get_docstring(ast.parse(path.read_text())) or "")
-        code = f"```{{literalinclude}} ../examples/{path.name}\n:language: python\n```"
-        sections.append(f"### `{path.name}`\n\n{told.replace('``', '`')}\n\n{code}")
-    return "\n\n".join(sections)
+def _included(path: str) -> str:
+    """Return the code block of a file, given by its path in the repository."""
+    language = {".py": "python", ".xml": "xml"}.get(Path(path).suffix, "yaml")
+    return f"```{{literalinclude}} ../{path}\n:language: {language}\n```"
 
 
 def _api() -> str:
@@ -118,8 +98,6 @@ def _plugins() -> str:
 
 
 GENERATED: dict[str, Callable[[], str]] = {
-    "gallery": _gallery,
-    "scripts": _scripts,
     "api": _api,
     "packages": _packages,
     "plugins": _plugins,
@@ -130,6 +108,7 @@ def _fill_in(app: Sphinx, docname: str, source: list[str]) -> None:
     if docname.startswith("examples/"):
         return
     source[0] = re.sub(r"<!-- generated: (\w+) -->", lambda match: GENERATED[match[1]](), source[0])
+    source[0] = re.sub(r"<!-- included: (\S+) -->", lambda match: _included(match[1]), source[0])
 
 
 def _undocumented(

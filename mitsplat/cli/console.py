@@ -130,8 +130,8 @@ def progress_bar(unit: str = "images/s") -> Iterator[Progress]:
 def stage_bar(unit: str = "%/s") -> Iterator[Progress]:
     """Show progress in stages on stderr: a bar on a terminal, otherwise one line per stage.
 
-    Without a terminal, a stage that takes longer prints one more line per minute, with the remaining time. The text
-    after a colon in the progress message is a detail and does not start a new stage.
+    Without a terminal, a stage that takes longer prints one more line per minute, with the remaining time once a tenth
+    of the stage is done. The text after a colon in the progress message is a detail and does not start a new stage.
     """
     if sys.stderr.isatty():
         with progress_bar(unit) as bar:
@@ -145,7 +145,8 @@ def stage_bar(unit: str = "%/s") -> Iterator[Progress]:
         if doing.partition(":")[0] != stage:
             stage, stage_start, first = doing.partition(":")[0], now, done
         elif now - last_report >= 60 and done > first:
-            left = f", {(now - stage_start) * (total - done) / (done - first):.0f} s left"
+            if done - first >= 0.1 * (total - first):
+                left = f", {(now - stage_start) * (total - done) / (done - first):.0f} s left"
         else:
             return
         last_report = now

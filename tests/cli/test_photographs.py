@@ -212,3 +212,18 @@ def test_a_log_has_stages_and_the_remaining_time(
         progress(2, 4, "fitting: 21.0 dB")
     told = capsys.readouterr().err.splitlines()
     assert told == ["  0 %: matching", " 50 %: matching, 70 s left", " 25 %: fitting: 20.0 dB"]
+
+
+def test_a_log_states_no_remaining_time_at_the_start_of_a_stage(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first step of segmentation takes a minute for all photos, and the other steps a second each."""
+    clock = iter([0.0, 62.0, 63.0, 124.0])
+    monkeypatch.setattr("mitsplat.cli.console.time.monotonic", lambda: next(clock))
+    with stage_bar() as progress:
+        progress(1, 30, "cutting out")
+        progress(2, 30, "cutting out")
+        progress(3, 30, "cutting out")
+        progress(25, 30, "cutting out")
+    told = capsys.readouterr().err.splitlines()
+    assert told == ["  3 %: cutting out", "  6 %: cutting out", " 83 %: cutting out, 26 s left"]

@@ -19,7 +19,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import layout_index_of, plan_frame
-from mitsplat.scene.planning.visibility_prediction import VisibilityPredictor
+from mitsplat.scene.planning.visibility_prediction import VisibilityPredictor, _occluded, _Occluders
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.camera_spec import Occlusion, Truncation
 from mitsplat.storage.field_types import StrictModel
@@ -183,6 +183,20 @@ def test_prediction_agrees_with_rays_through_every_pixel(scene: Scene, wall: boo
             assert (visible < 0.9).any()
     assert np.mean(errors) < 0.02
     assert max(errors) < 0.12
+
+
+def test_possible_occluders_contain_every_triangle_that_hides_a_point() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.1, 0.1, (40, 3))
+    triangles = rng.uniform(-0.5, 0.5, (200, 1, 3)) + rng.uniform(-0.2, 0.2, (200, 3, 3))
+    occluders, count = _Occluders(triangles, points), 0
+    for eye in rng.uniform(-1, 1, (20, 3)):
+        possible = occluders.towards(eye)
+        count += len(possible)
+        assert _occluded(eye, points, possible).tolist() == _occluded(eye, points, triangles).tolist()
+    assert 0 < count < 0.6 * 20 * len(triangles)
+    assert len(_Occluders(triangles, points[:0]).towards(np.zeros(3))) == 0
+    assert len(_Occluders(triangles[:0], points).towards(np.zeros(3))) == 0
 
 
 def test_prediction_counts_occlusion_and_truncation(scene: Scene) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import trimesh
@@ -33,6 +33,12 @@ class PlacedShape:
     stated: trimesh.Trimesh
     mesh: trimesh.Trimesh
     motion: Float64Array
+
+    @cached_property
+    def bounds(self) -> tuple[Float64Array, Float64Array]:
+        """Lower and upper corner of the bounding box of ``mesh`` [m]; trimesh hashes the vertices at each access."""
+        low, high = self.mesh.bounds
+        return low, high
 
 
 def is_present(shape: Shape, seed: int, layout: int) -> bool:

@@ -118,10 +118,11 @@ class VisibilityPredictor:
         self._spacing = _spacing(scene) * float(np.sqrt(step))
         self._radii = np.array([np.linalg.norm(mesh.extents) / 2 for mesh in meshes])
         shapes = [placed.mesh for placed in placed_shapes(scene, layout.index) if placed.shape.visible]
-        self._triangles = np.concatenate([np.zeros((0, 3, 3)), *(mesh.triangles for mesh in shapes)])
+        triangles = np.concatenate([np.zeros((0, 3, 3)), *(mesh.triangles for mesh in shapes)])
+        self._occluders = _Occluders(triangles, self._points)
         here = scene.environment_of(layout.index)
         around = [] if here is None or here.mesh is None else [here.mesh]
-        self._static_triangles = _Triangles(np.concatenate([self._triangles, *(mesh.triangles for mesh in around)]))
+        self._static_triangles = _Triangles(np.concatenate([triangles, *(mesh.triangles for mesh in around)]))
 
     @staticmethod
     @lru_cache(maxsize=2)
@@ -180,7 +181,7 @@ class VisibilityPredictor:
         x, y = (np.asarray((n + 0.5) * cell_size, np.float64) for n in (cell % across - left, cell // across - above))
         shown = _within(x, y, camera, 0)
         seen &= shown
-        triangles = _possible_occluders(self._triangles, camera.centre, self._points)
+        triangles = self._occluders.towards(camera.centre)
         if len(triangles):
             seen[seen] = ~_occluded(camera.centre, self._points[nearest[seen]], triangles)
         seen_cells, own = (np.bincount(owner[some], minlength=count) for some in (seen, shown))
@@ -238,7 +239,10 @@ def enclosing_shape(scene: Scene, point: Float64Array, layout: int = 0) -> str:
     """Return the name of a visible shape that contains a point [m] and not the centre of the region, or empty."""
     middle = (np.array(scene.spec.region.min) + scene.spec.region.max) / 2
     for placed in placed_shapes(scene, layout):
-        if placed.shape.visible and points_inside(placed.mesh, np.stack([point, middle])).tolist() == [True, False]:
+        low, high = placed.bounds
+        if not placed.shape.visible or not ((point > low) & (point < high)).all():
+            continue
+        if points_inside(placed.mesh, np.stack([point, middle])).tolist() == [True, False]:
             return placed.shape.name
     return ""
 
@@ -317,22 +321,31 @@ class _Triangles:
         return min(reach, float(np.linalg.norm(closest - point, axis=1).min()))
 
 
-def _possible_occluders(triangles: Float64Array, eye: Float64Array, points: Float64Array) -> Float64Array:
-    """Return the triangles that can intersect a line of sight.
+class _Occluders:
+    """Triangles (T, 3, 3) [m] that may hide points from an eye."""
 
-    A triangle cannot if the bounding box of the points is on the same side of its plane as the eye.
-    """
-    if not len(triangles) or not len(points):
-        return triangles[:0]
-    low, high = points.min(axis=0), points.max(axis=0)
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    corners = np.stack(np.meshgrid(*np.stack([low, high]).T, indexing="ij"), axis=-1).reshape(-1, 3)
-    here = np.einsum("ti,ti->t", normals, eye - triangles[:, 0])
-    there = np.einsum("ti,tci->tc", normals, corners - triangles[:, :1])
-    # Objects penetrate their support by less than 0.1 mm.
-    slack = 1e-4 * np.linalg.norm(normals, axis=1)
-    other = there * np.sign(here)[:, None] < -slack[:, None]
-    return np.asarray(triangles[other.any(axis=1) & (np.abs(here) > 0)])
+    def __init__(self, triangles: Float64Array, points: Float64Array) -> None:
+        self._triangles = triangles if len(points) else triangles[:0]
+        if not len(self._triangles):
+            return
+        low, high = points.min(axis=0), points.max(axis=0)
+        self._normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        corners = np.stack(np.meshgrid(*np.stack([low, high]).T, indexing="ij"), axis=-1).reshape(-1, 3)
+        there = np.einsum("ti,tci->tc", self._normals, corners - triangles[:, :1])
+        # Objects penetrate their support by less than 0.1 mm.
+        slack = 1e-4 * np.linalg.norm(self._normals, axis=1)
+        self._reach_front = there.max(axis=1) > slack
+        self._reach_back = there.min(axis=1) < -slack
+
+    def towards(self, eye: Float64Array) -> Float64Array:
+        """Return the triangles that can intersect a line of sight from a point [m].
+
+        A triangle cannot if the bounding box of the points is on the same side of its plane as the eye.
+        """
+        if not len(self._triangles):
+            return self._triangles
+        here = np.einsum("ti,ti->t", self._normals, eye - self._triangles[:, 0])
+        return np.asarray(self._triangles[((here > 0) & self._reach_back) | ((here < 0) & self._reach_front)])
 
 
 def _occluded(eye: Float64Array, points: Float64Array, triangles: Float64Array) -> BoolArray:

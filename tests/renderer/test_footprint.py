@@ -13,8 +13,8 @@ import trimesh
 from mitsplat.renderer.layers import make_integrator, make_splats_shape
 from mitsplat.renderer.light import light_points as footprint
 from mitsplat.renderer.light.light_estimate import Estimate
-from mitsplat.renderer.light.light_filter import GAIN, SMALL_FILTER_PIXELS, LightFilter
-from mitsplat.renderer.light.light_points import OFFSETS
+from mitsplat.renderer.light.light_filter import GAIN, SMALL_FILTER_PIXELS, UNTRACED, LightFilter
+from mitsplat.renderer.light.light_points import OFFSETS, LightPoints
 from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.rays.camera_rays import CameraView
 from tests.renderer.test_light import down_camera, floor, render
@@ -32,6 +32,25 @@ def ridges(period: float, slope: float, extent: float = 0.5) -> trimesh.Trimesh:
     far = left + len(x)
     faces = np.concatenate([np.stack([left, left + 1, far], 1), np.stack([left + 1, far + 1, far], 1)])
     return trimesh.Trimesh(vertices, faces, process=False)
+
+
+@pytest.mark.parametrize("bent", [[], [4, 1, 6]])
+def test_sums_by_pixel_add_the_points_of_bent_pixels(bent: list[int]) -> None:
+    make_integrator()
+    count, points = 8, len(OFFSETS)
+    slot = np.full(count, UNTRACED, np.uint32)
+    slot[bent] = np.arange(len(bent))
+    owner = np.concatenate([np.arange(count), np.tile(bent, points)]).astype(np.uint32)
+    surface: Any = None
+    places = LightPoints(surface, mi.UInt32(owner), mi.UInt32(slot), mi.UInt32(bent), count, len(bent))
+    values = np.random.default_rng(0).random((4, len(owner))).astype(np.float32)
+    lit, squares = mi.Color3f(*[mi.Float(row) for row in values[:3]]), mi.Float(values[3])
+    sums = places.sums_by_pixel(Estimate(lit, lit, lit, lit, squares, squares, squares))
+    expected = values[:, :count].copy()
+    for number, pixel in enumerate(bent):
+        expected[:, pixel] = values[:, count + number :: len(bent)].sum(axis=1)
+    assert np.allclose(np.array(sums.lit), expected[:3], rtol=1e-6)
+    assert np.allclose(np.array(sums.rays), expected[3], rtol=1e-6)
 
 
 def test_ridges_finer_than_a_pixel_have_the_mean_light_of_its_points(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -112,7 +112,7 @@ class CapturedHits:
             added colour = min(captured * white / E, 1) * mean colour of objects over the cosine-weighted hemisphere
         """
         near_objects = boxes.form_factor(place.p, place.n) > MIN_COVER
-        dr.eval(place.p, place.n, near_objects)
+        dr.eval(place.p, place.n, near_objects, captured, key)  # in one kernel; gathers evaluate each in its own
         lane = dr.compress(near_objects)
         if not dr.width(lane):
             return None
@@ -124,7 +124,7 @@ class CapturedHits:
             ray.maxt = self.emitters.sky_reach
         near = dynamic.intersect(ray)
         hits_object = near.is_valid()
-        dr.eval(ray, near, hits_object, emitter_sample)
+        dr.eval(ray, near, hits_object, emitter_sample, captured, normal, key)
         row = dr.compress(hits_object)
         if not dr.width(row):
             return None

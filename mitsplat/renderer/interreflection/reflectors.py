@@ -183,7 +183,7 @@ class Reflectors:
         has_colour = dr.max(colour) > 0
         boxes = self.proxies.boxes if bounces > 1 and dynamic.materials is not None else None
         weight = mi.Color3f(1) if boxes is None else dr.full(mi.Color3f, 1, dr.width(key))
-        dr.eval(near, colour, captured, hits_object, distance, has_colour, weight)
+        dr.eval(near, colour, captured, hits_object, distance, has_colour, weight, key, emitter_sample)
         paths = Paths(ray, near, key, emitter_sample, spread, weight)
         lane = dr.compress(has_colour)
         if static is not None and dr.width(lane):
@@ -200,6 +200,7 @@ class Reflectors:
         lane = dr.compress(hits_object)
         if dr.width(lane):
             light = dr.gather(mi.Color3f, colour, lane) + self._reflected(bounces, gathered(paths, lane))
+            dr.eval(light)  # avoids a copy of the colours before the write
             dr.scatter(colour, light, lane)  # scatter_add compiles per size
         dr.eval(colour)
         return colour, captured, distance

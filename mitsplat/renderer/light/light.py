@@ -92,10 +92,9 @@ def light_factor(
     pixels = TracedPixels.of(lighting, index, coarse)
     estimate = pixels.trace_first_rays()
     unoccluded = UnoccludedLight.integrate(emitters, pixels.points, pixels.here, white)
-    bounced = None
-    if bounce:
-        bounced = trace_bounce(pixels.centre_tracer(), reflectors, pixels.points.sums_by_pixel(estimate), cover)
-    estimate, exposure = pixels.trace_further_rays(estimate, unoccluded.level, others)
+    sums = pixels.points.sums_by_pixel(estimate)
+    bounced = trace_bounce(pixels.centre_tracer(), reflectors, sums, cover) if bounce else None
+    estimate, exposure = pixels.trace_further_rays(estimate, sums, unoccluded.level, others)
     estimate = pixels.points.sums_by_pixel(estimate)
     means = pixels.light_filter.smooth(estimate, None if bounced is None else bounced.relit)
     light = pixels.combine(light, unoccluded, means, bounced)

@@ -8,7 +8,9 @@ so that only their unoccluded light costs extra time.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TypeVar
 
 import drjit as dr
@@ -43,12 +45,14 @@ class LightPoints:
         surface: The points, by row.
         owner: Index of the pixel, by row.
         slot: Index among bent pixels, by pixel; ``UNTRACED`` if the pixel is not bent.
+        bent_pixels: Indices of the bent pixels.
         count, bent: Number of pixels, and number of bent pixels among them.
     """
 
     surface: LitSurface
     owner: mi.UInt32
     slot: mi.UInt32
+    bent_pixels: mi.UInt32
     count: int
     bent: int
 
@@ -71,7 +75,7 @@ class LightPoints:
         bent = dr.width(in_image)
         slot = dr.full(mi.UInt32, UNTRACED, count)
         if not bent:
-            return cls(here, dr.arange(mi.UInt32, count), slot, count, 0)
+            return cls(here, dr.arange(mi.UInt32, count), slot, in_image, count, 0)
         among = dr.gather(mi.UInt32, order, dr.compress(dr.gather(mi.Bool, bends, order)))
         dr.scatter(slot, dr.arange(mi.UInt32, bent), among, mode=dr.ReduceMode.Permute)
         owner = concatenated([among] * len(OFFSETS))
@@ -91,25 +95,27 @@ class LightPoints:
         columns = [(getattr(here, f.name), getattr(around, f.name), getattr(own, f.name)) for f in fields(LitSurface)]
         surface = LitSurface(*[concatenated([a, dr.select(middle, c, b)]) for a, b, c in columns])
         owner = concatenated([dr.arange(mi.UInt32, count), owner])
-        dr.eval(surface, owner, slot)
-        return cls(surface, owner, slot, count, bent)
+        dr.eval(surface, owner, slot, among)
+        return cls(surface, owner, slot, among, count, bent)
 
     @property
     def valid_share(self) -> mi.Float:
         """Share of the points of every pixel that lie on a surface."""
         valid = dr.select(self.surface.valid, mi.Float(1), 0)
         dr.eval(valid)
-        return self.sum_by_pixel(valid) / dr.select(self.slot != UNTRACED, mi.Float(len(OFFSETS)), 1)
+        return self._sums_by_pixel([valid])[0] / dr.select(self.slot != UNTRACED, mi.Float(len(OFFSETS)), 1)
 
     def rows(self, places: mi.UInt32) -> mi.UInt32:
         """Return the rows of the points of some pixels (possibly none)."""
         if not dr.width(places):
             return places
         slot = dr.gather(mi.UInt32, self.slot, places)
-        even = dr.gather(mi.UInt32, places, dr.compress(slot == UNTRACED))
-        slot = dr.gather(mi.UInt32, slot, dr.compress(slot != UNTRACED))
+        is_bent, is_even = slot != UNTRACED, slot == UNTRACED
+        dr.eval(slot, is_bent, is_even)
+        even = dr.gather(mi.UInt32, places, dr.compress(is_even))
+        slot = dr.gather(mi.UInt32, slot, dr.compress(is_bent))
         dr.eval(even, slot)  # keeps the kernels independent of which kinds occur
-        rows = concatenated([even, *[slot + start for start in self._starts()]]) if dr.width(slot) else even
+        rows = concatenated([even, *[slot + start for start in self._starts]]) if dr.width(slot) else even
         dr.eval(rows)
         return rows
 
@@ -124,23 +130,27 @@ class LightPoints:
         middle = rows < count
         return dr.select(middle, 0, number), dr.select(middle, mi.UInt32(1), len(OFFSETS))
 
-    def sum_by_pixel(self, values: mi.Float | mi.Color3f) -> mi.Float | mi.Color3f:
-        """Sum values by row into values by pixel, in a fixed order."""
-        slot = dr.gather(mi.UInt32, self.slot, dr.arange(mi.UInt32, self.count))
-        several, total = slot != UNTRACED, type(values)(0)
-        for start in self._starts():
-            total += dr.gather(type(values), values, slot + start, several)
-        return dr.select(several, total, dr.gather(type(values), values, dr.arange(mi.UInt32, self.count)))
+    def _sums_by_pixel(self, columns: Sequence[mi.Float | mi.Color3f]) -> list[mi.Float | mi.Color3f]:
+        """Sum columns by row into columns by pixel, in a fixed order."""
+        pixel, bend = dr.arange(mi.UInt32, self.count), dr.arange(mi.UInt32, self.bent)
+        sums = [dr.gather(type(column), column, pixel) for column in columns]
+        if self.bent:
+            parts = [[dr.gather(type(column), column, bend + start) for start in self._starts] for column in columns]
+            totals = [sum(part, type(column)(0)) for column, part in zip(columns, parts, strict=True)]
+            dr.eval(sums, totals)
+            for pixels, total in zip(sums, totals, strict=True):
+                dr.scatter(pixels, total, self.bent_pixels, mode=dr.ReduceMode.Permute)
+        dr.eval(sums)
+        return sums
 
     def mean_by_pixel(self, values: Values, rows: mi.UInt32, valid: mi.Bool, places: mi.UInt32) -> Values:
         """Return means over the valid points of the pixels ``places``, whose rows are ``rows``."""
-        sums = []
-        for column in (values, mi.Float(1)):
-            by_row = dr.zeros(type(column), dr.width(self.owner))
-            dr.scatter(by_row, dr.select(valid, column, 0), rows)
-            dr.eval(by_row)
-            sums.append(dr.gather(type(column), self.sum_by_pixel(by_row), places))
-        mean = sums[0] / dr.maximum(sums[1], 1)
+        columns = [dr.zeros(kind, dr.width(self.owner)) for kind in (type(values), mi.Float)]
+        for column, value in zip(columns, (values, mi.Float(1)), strict=True):
+            dr.scatter(column, dr.select(valid, value, 0), rows)
+        dr.eval(columns)
+        total, count = (dr.gather(type(sums), sums, places) for sums in self._sums_by_pixel(columns))
+        mean = total / dr.maximum(count, 1)
         dr.eval(mean)
         return mean
 
@@ -148,11 +158,11 @@ class LightPoints:
         """Sum a dataclass of values by row into values by pixel."""
         if not self.bent:
             return sums
-        result = type(sums)(*[self.sum_by_pixel(getattr(sums, f.name)) for f in fields(sums)])
-        dr.eval(result)
-        return result
+        return type(sums)(*self._sums_by_pixel([getattr(sums, f.name) for f in fields(sums)]))
 
+    @cached_property
     def _starts(self) -> list[mi.UInt32]:
+        """First rows of the first points of all bent pixels, of their second points, and so on."""
         return [dr.opaque(mi.UInt32, self.count + number * self.bent) for number in range(len(OFFSETS))]
 
 

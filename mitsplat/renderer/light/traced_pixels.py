@@ -126,7 +126,9 @@ class TracedPixels:
             estimate = self._point_tracer.trace(rows, estimate, rays, first, points.steps(rows))
         return estimate
 
-    def trace_further_rays(self, estimate: Estimate, level: mi.Float, others: mi.UInt32) -> tuple[Estimate, mi.Float]:
+    def trace_further_rays(
+        self, estimate: Estimate, sums: Estimate, level: mi.Float, others: mi.UInt32
+    ) -> tuple[Estimate, mi.Float]:
         """Trace more rays from pixels whose light has not reached the wanted error.
 
         The number of rays is doubled until it suffices for the variance of the first rays, see
@@ -134,7 +136,8 @@ class TracedPixels:
         together, so that no lane idles.
 
         Args:
-            estimate: Estimate from the rays so far.
+            estimate: Estimate from the rays so far, by row of the sample points.
+            sums: The same estimate, by pixel.
             level: Unoccluded light over white, by pixel.
             others: Number of pixels without traced light that show a surface.
 
@@ -145,7 +148,6 @@ class TracedPixels:
         if accuracy.error == 0:
             return estimate, mi.Float(1)
         first = accuracy.first
-        sums = points.sums_by_pixel(estimate)
         wanted, exposure = self.light_filter.rays_for(sums, accuracy.error, level, others if accuracy.metered else None)
         if first >= accuracy.most:
             return estimate, exposure

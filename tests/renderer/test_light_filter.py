@@ -1,4 +1,4 @@
-"""Filter of traced light: penumbrae without saw-teeth, and hard edges."""
+"""Filter of traced light: penumbrae without saw-teeth, hard edges, and points that are not known."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from mitsplat.arrays import Float64Array
 from mitsplat.renderer.layers import make_integrator
 from mitsplat.renderer.light.light_estimate import Estimate
-from mitsplat.renderer.light.light_filter import LightFilter
+from mitsplat.renderer.light.light_filter import GUESS_WEIGHT, LightFilter
 from mitsplat.renderer.light.light_tiles import STRIDE
 from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.light.shadow_rays import SURROUNDINGS_RECURRENCE, _bayer, sequence_point
@@ -76,3 +76,20 @@ def test_hard_edges_stay_sharp() -> None:
         light = filtered(share.T if turned else share, 0.6)
         light = light.T if turned else light
         assert np.abs(light - share).max() < 1e-6
+
+
+def test_unknown_points_take_the_light_of_the_nearest_known_ones() -> None:
+    """Weights fall with the fourth power of the distance, and the outermost pixel has half of its weight."""
+    make_integrator()
+    width, unknown = 12, 8
+    camera = down_camera(size=width)
+    view = CameraView(width, 1, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    x = np.arange(width, dtype=np.float32)
+    fields: dict[str, Any] = dict.fromkeys(LitSurface.__dataclass_fields__, mi.Float(0))
+    fields |= {"position": dr.zeros(mi.Point3f, width), "normal": mi.Vector3f(0, 0, 1), "offset": mi.Float(1)}
+    fields |= {"known": mi.Bool(x != unknown), "trait": mi.Float(np.float32(x > unknown))}
+    light = np.where(x == unknown, 100, x * x)
+    light_filter = LightFilter(LitSurface(**fields), view, dr.arange(mi.UInt32, width))
+    (mean,) = light_filter.average([mi.Float(np.float32(light))])
+    weight = np.array([GUESS_WEIGHT, 1, 1 / 16, 1 / 81, 0.5 / 256])
+    np.testing.assert_allclose(np.array(mean)[unknown], weight @ light[8:3:-1] / weight.sum(), rtol=1e-5)

@@ -80,7 +80,7 @@ class LightFilter:
     columns have similar windows. Equal sums stay equal, so that the ratio of an unshadowed point is exactly 1.
 
     At a silhouette, a pixel may show one instance while its ray hits the proxy of another. Such a point takes its light
-    from known neighbours that show the same instance.
+    from the nearest known neighbours that show the same instance.
     """
 
     def __init__(
@@ -312,7 +312,8 @@ class LightFilter:
             same &= alike | (known & ~here.known)
             # With half weights at the ends, the filter spans exactly one period of the dither.
             weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(distance == last, mi.Float(0.5), 1.0)
-            weight *= dr.select(alike, likely, 1)
+            # Shadows at contacts change from row to row: the nearest known neighbours of other points count most.
+            weight *= dr.select(alike, likely, dr.rcp(dr.square(dr.square(mi.Float(distance)))))
             squares += dr.select(same, weight * weight * rays, 0)
             weight = dr.select(same, weight * rays, 0)
             theirs = dr.gather(mi.ArrayXf, images, place, same, shape=(_padded(len(values)), width))

@@ -14,7 +14,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.decomposition import MAX_PIECES, convex_pieces, max_gap
-from mitsplat.geometry.hull_facets import merge_facets
+from mitsplat.geometry.hull_facets import contact_pieces
 from mitsplat.geometry.mesh import MassProperties, join_meshes, mass_properties, prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 from mitsplat.physics.contacts import newton_hull
@@ -24,10 +24,6 @@ from mitsplat.scene.spec.shape_spec import Shape
 from mitsplat.scene.walls import bin_walls, pose_matrix
 
 _CONCAVITIES = (0.02, 0.01, 0.005)  # concavity of convex pieces, from coarse to fine
-# Hulls with more facets are those of scans, whose flat sides consist of many facets. MuJoCo finds the contacts of one
-# facet of each body, in each step of another one, so that a stack of three scanned boxes creeps at 3 mm/s. Facets are
-# merged within an angle [degrees] and a depth [m], or share of the size: then it creeps at less than 0.01 mm/s.
-_SCAN_FACETS, _FACET_ANGLE, _FACET_DEPTH, _FACET_DEPTH_SHARE = 300, 1.5, 3e-4, 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,19 +74,52 @@ def all_pieces(bodies: Iterable[Body], colliders: Iterable[Collider]) -> Iterato
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Physics data of an asset; ``standoff`` as in :func:`mitsplat.geometry.mesh_distance.standoff`."""
+    """Physics data of an asset. What takes long is computed at its first use: a layout has few assets of a large pool.
 
-    body: Body
-    surface: DistanceSurface
-    standoff: float
+    Attributes:
+        asset: The asset.
+        mesh: Its mesh for physics [m].
+        progress: Callback for slow operations.
+    """
+
+    asset: Asset
+    mesh: trimesh.Trimesh
+    progress: Note
+
+    @cached_property
+    def surface(self) -> DistanceSurface:
+        """The surface, for distances."""
+        return DistanceSurface(self.mesh)
+
+    @cached_property
+    def body(self) -> Body:
+        """The rigid body."""
+        mass = mass_properties(self.mesh, self._pieces[0], density=self.asset.density, mass=self.asset.mass)
+        return Body(self._pieces[1], mass, _material(self.asset))
+
+    @property
+    def standoff(self) -> float:
+        """Standoff of the body's pieces, see :func:`mitsplat.geometry.mesh_distance.standoff` [m]."""
+        return self._pieces[2]
+
+    @cached_property
+    def _pieces(self) -> tuple[Sequence[trimesh.Trimesh], tuple[trimesh.Trimesh, ...], float]:
+        """Convex pieces, those for contacts, and the standoff of these [m]."""
+        if self.asset.pieces:
+            shape = contact_pieces(self.asset.pieces)
+            return self.asset.pieces, shape, standoff(self.surface, shape)
+        limit = max_gap(float(self.mesh.extents.max()))
+        for threshold in _CONCAVITIES:
+            pieces = _pieces(self.mesh, self.asset.name, self.progress, threshold=threshold)
+            shape = contact_pieces(pieces)
+            distance = standoff(self.surface, shape)
+            if distance <= limit:
+                break
+        return pieces, shape, distance
 
 
 def make_body(asset: Asset, progress: Note) -> Body:
-    """Return the rigid body of an asset: its convex pieces, computed if it has none, its mass and its material.
-
-    Raises:
-        InputError: If the asset has no mesh, or its mesh has no volume.
-    """
+    """Return the rigid body of an asset: its convex pieces, computed if it has none, its mass and its material."""
     return make_part(asset, progress).body
 
 
@@ -113,41 +142,14 @@ def make_collider(surface: Asset | Shape, mesh: trimesh.Trimesh, progress: Note)
 
 
 def make_part(asset: Asset, progress: Note) -> Part:
-    """Build the physics data of an asset."""
+    """Return the physics data of an asset, whose mesh is checked at once.
+
+    Raises:
+        InputError: If the asset has no mesh, or its mesh has no volume.
+    """
     if asset.mesh is None:
         raise InputError(f"asset {asset.name!r} must have a mesh for physics (got none)")
-    mesh = prepare_mesh(asset.mesh, f"asset {asset.name!r}")
-    surface = DistanceSurface(mesh)
-    pieces = shape = asset.pieces
-    standoff_distance = 0.0
-    if pieces:
-        shape = contact_pieces(pieces)
-        standoff_distance = standoff(surface, shape)
-    else:
-        limit = max_gap(float(mesh.extents.max()))
-        for threshold in _CONCAVITIES:
-            pieces = _pieces(mesh, asset.name, progress, threshold=threshold)
-            shape = contact_pieces(pieces)
-            standoff_distance = standoff(surface, shape)
-            if standoff_distance <= limit:
-                break
-    mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass)
-    return Part(Body(shape, mass, _material(asset)), surface, standoff_distance)
-
-
-def contact_pieces(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]:
-    """Return convex pieces with merged facets where they are hulls of scans."""
-    size = max(float(np.ptp(piece.vertices, axis=0).max()) for piece in pieces)
-    depth = min(_FACET_DEPTH, _FACET_DEPTH_SHARE * size)
-    return tuple(
-        merge_facets(piece, angle=_FACET_ANGLE, tolerance=depth) if _facet_count(piece) > _SCAN_FACETS else piece
-        for piece in pieces
-    )
-
-
-def _facet_count(piece: trimesh.Trimesh) -> int:
-    """Return the number of facets of a convex mesh; coplanar triangles are one."""
-    return len(np.unique(np.round(piece.face_normals, 6), axis=0)) if len(piece.faces) > _SCAN_FACETS else 0
+    return Part(asset, prepare_mesh(asset.mesh, f"asset {asset.name!r}"), progress)
 
 
 def _material(surface: Asset | Shape) -> ContactMaterial:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from copy import copy
+from functools import cached_property
 from typing import Any
 
 import newton
@@ -28,12 +29,17 @@ class ContactFinder:
     contacts do not depend on earlier models.
 
     Args:
-        pieces: Convex pieces of all objects that may be simulated.
+        pieces: Convex pieces of all objects that may be simulated. They are read when the first pipeline is made.
     """
 
     def __init__(self, pieces: Iterable[trimesh.Trimesh]) -> None:
-        self._pieces = tuple(pieces)
+        self._pieces = pieces
         self._narrow_phase: NarrowPhase | None = None
+
+    @cached_property
+    def _largest(self) -> newton.Mesh:
+        """The hull of most vertices. With many vertices, the support search changes for all hulls: it decides."""
+        return newton_hull(max(self._pieces, key=lambda piece: len(piece.vertices)))
 
     def pipeline(self, model: newton.Model, *, max_contacts: int) -> newton.CollisionPipeline:
         """Return a pipeline for a model of boxes and convex hulls.
@@ -42,7 +48,7 @@ class ContactFinder:
         """
         pairs = model.shape_count * (model.shape_count - 1) // 2
         if self._narrow_phase is None or self._narrow_phase.max_candidate_pairs < pairs:
-            self._narrow_phase = _generate(self._pieces, _PAIR_CAPACITY_FACTOR * pairs)
+            self._narrow_phase = _generate(self._largest, _PAIR_CAPACITY_FACTOR * pairs)
         narrow_phase = copy(self._narrow_phase)
         narrow_phase.shape_aabb_lower, narrow_phase.shape_aabb_upper = (
             wp.zeros(model.shape_count, dtype=wp.vec3, device=model.device) for _ in range(2)
@@ -57,10 +63,8 @@ class ContactFinder:
         )
 
 
-def _generate(pieces: Sequence[trimesh.Trimesh], max_pairs: int) -> NarrowPhase:
-    """Generate a narrow phase for boxes and these hulls."""
-    # If one hull has many vertices, the support search changes for all hulls; the largest hull therefore decides.
-    hull = newton_hull(max(pieces, key=lambda piece: len(piece.vertices)))
+def _generate(hull: newton.Mesh, max_pairs: int) -> NarrowPhase:
+    """Generate a narrow phase for boxes, and for hulls of at most as many vertices as this one."""
     builder = newton.ModelBuilder()
     builder.add_shape_box(-1)
     builder.add_shape_convex_hull(-1, mesh=hull)

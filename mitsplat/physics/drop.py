@@ -12,9 +12,8 @@ from functools import lru_cache
 import numpy as np
 
 from mitsplat.arrays import BoolArray, Float64Array
-from mitsplat.asset import Asset
 from mitsplat.errors import InputError
-from mitsplat.physics.bodies import Part, make_part
+from mitsplat.physics.bodies import make_part
 from mitsplat.physics.certificate import RestingObject, RestingState
 from mitsplat.physics.handling import draw_handling
 from mitsplat.physics.mujoco_world import MujocoWorld
@@ -118,15 +117,15 @@ class Drop:
 
     def __init__(self, scene: Scene, progress: Note) -> None:
         self.scene = scene
-        self._parts: dict[int, Part] = {}
         self._worlds: dict[tuple[tuple[int, ...], float, int], World] = {}
         self._world_count = 0
-        self.objects = [self._part(asset, progress) for asset in scene.assets]
+        meshes = {id(asset.mesh): asset for asset in reversed(scene.assets)}  # entries may share a mesh
+        parts = {key: make_part(asset, progress) for key, asset in meshes.items()}
+        self.objects = [parts[id(asset.mesh)] for asset in scene.assets]
         self.start_poses = StartPoses(scene, self.objects)
         self._surroundings = (scene.environments if scene.spec.environment_collides else ()) or (None,)
-        bodies = [part.body for part in self.objects]
         self.static_scenes = {
-            number: make_static_scene(scene, bodies, around, progress)
+            number: make_static_scene(scene, self.objects, around, progress)
             for number, around in enumerate(self._surroundings)
         }
         for static in self.static_scenes.values():
@@ -317,8 +316,8 @@ class Drop:
             return number
         key = len(self._surroundings) + layout
         if key not in self.static_scenes:
-            bodies, around = [part.body for part in self.objects], self._surroundings[number]
-            self.static_scenes = {key: make_static_scene(self.scene, bodies, around, discard_note, layout)}
+            around = self._surroundings[number]
+            self.static_scenes = {key: make_static_scene(self.scene, self.objects, around, discard_note, layout)}
         return key
 
     def _run(
@@ -396,12 +395,6 @@ class Drop:
                 )
             )
         return self._worlds[key]
-
-    def _part(self, asset: Asset, progress: Note) -> Part:
-        """Build the physics data of an asset, once for all entries that share its mesh."""
-        if id(asset.mesh) not in self._parts:
-            self._parts[id(asset.mesh)] = make_part(asset, progress)
-        return self._parts[id(asset.mesh)]
 
     def _instances(self, drawn: Sequence[_DrawnObject], poses: Float64Array) -> tuple[Instance, ...]:
         return tuple(

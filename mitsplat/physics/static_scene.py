@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.mesh import prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface, PlacedSurface
-from mitsplat.physics.bodies import Body, Collider, all_pieces, make_collider
+from mitsplat.physics.bodies import Collider, Part, all_pieces, make_collider
 from mitsplat.physics.contacts import ContactFinder
 from mitsplat.progress import Note
 from mitsplat.scene.planning.shape_poses import placed_shapes
@@ -38,13 +38,13 @@ class StaticScene:
 
 
 def make_static_scene(
-    scene: Scene, bodies: Sequence[Body], surroundings: Asset | None, progress: Note, layout: int | None = None
+    scene: Scene, objects: Iterable[Part], surroundings: Asset | None, progress: Note, layout: int | None = None
 ) -> StaticScene:
     """Build the static scene from colliding shapes and, optionally, surroundings.
 
     Args:
         scene: The scene.
-        bodies: All bodies that may fall on it.
+        objects: Physics data of all objects that may fall on it.
         surroundings: Environment that collides.
         progress: Callback for slow operations.
         layout: Index of the layout whose shapes are used, or None for all shapes of the scene file.
@@ -86,7 +86,7 @@ def make_static_scene(
     return StaticScene(
         tuple(colliders),
         tuple(obstacles),
-        ContactFinder(all_pieces(bodies, colliders)),
+        ContactFinder(all_pieces((part.body for part in objects), colliders)),
         (outer_low, outer_high),
         (inner_low, inner_high),
     )

@@ -26,6 +26,7 @@ from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.spec.shape_spec import Region
 from tests.bodies import STEPPERS, lowest, pose_at
+from tests.conftest import box_asset
 
 pytestmark = pytest.mark.usefixtures("physics")
 
@@ -291,6 +292,23 @@ def test_simulations_are_freed(scene_data, write_scene, monkeypatch):
     finally:
         gc.enable()
     assert gone == [True, True, True, False]
+
+
+def test_contact_shapes_are_made_for_the_assets_of_a_layout_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a large pool, a layout has few assets. Every mesh is checked nevertheless."""
+    from mitsplat.physics import bodies
+
+    made = []
+    monkeypatch.setattr(bodies, "contact_pieces", lambda pieces: (made.append(pieces), tuple(pieces))[1])
+    boxes = [box_asset(f"box_{edge}", (edge, edge, edge)) for edge in (0.02, 0.03, 0.04)]
+    parts = [bodies.make_part(box, lambda text: None) for box in boxes]
+    assert made == []
+    assert parts[1].body.size == pytest.approx(0.03)
+    assert parts[1].body is parts[1].body
+    assert len(made) == 1
+    flat = replace(boxes[0], mesh=trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2]]))
+    with pytest.raises(InputError, match="must enclose a volume"):
+        bodies.make_part(flat, lambda text: None)
 
 
 @pytest.fixture

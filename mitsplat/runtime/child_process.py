@@ -137,7 +137,7 @@ def run_function() -> None:
     data = sys.stdin.buffer.read()
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # libraries print to stdout
-    limit_memory(int(memory))
+    limit_memory(int(memory), final=True)
     try:
         function(output, data, *arguments)
         output.flush()
@@ -149,11 +149,13 @@ def run_function() -> None:
     os._exit(0)  # with limited memory, the shutdown of a driver may hang
 
 
-def limit_memory(memory: int) -> None:
-    """Lower the limit of a child's address space to its present size plus ``memory`` [bytes]."""
+def limit_memory(memory: int, *, final: bool = False) -> None:
+    """Limit a child's address space to its present size plus ``memory`` [bytes]; no later limit exceeds a final one."""
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     bound = _address_space() + memory
-    resource.setrlimit(resource.RLIMIT_AS, (bound if most == resource.RLIM_INFINITY else min(bound, most), most))
+    if most != resource.RLIM_INFINITY:
+        bound = min(bound, most)
+    resource.setrlimit(resource.RLIMIT_AS, (bound, bound if final else most))
 
 
 def _address_space() -> int:

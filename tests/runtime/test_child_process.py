@@ -46,6 +46,11 @@ def fill_twice(output, data, small, large):
     output.write(b"large")
 
 
+def exceed(output, data, amount):
+    limit_memory(4 * int(amount))
+    bytearray(int(amount))
+
+
 def die(output, data):
     os.abort()
 
@@ -82,6 +87,10 @@ class TestBounded:
     def test_a_part_may_have_a_lower_bound(self):
         ended = run_bounded(fill_twice, str(GIB // 8), str(GIB // 2), memory=GIB, seconds=30)
         assert ended == (1, b"small ", "MemoryError")
+
+    def test_the_function_cannot_raise_the_bound(self):
+        ended = run_bounded(exceed, str(GIB), memory=GIB // 2, seconds=30)
+        assert ended == (1, b"", "MemoryError")
 
     def test_a_signal_is_reported_by_its_number(self):
         assert run_bounded(die, memory=GIB, seconds=30) == (-6, b"", "stopped with status -6")

@@ -24,6 +24,11 @@ def pose_at(position: ArrayLike, rotation: Rotation | None = None) -> NDArray[np
     return pose
 
 
+def draw_start_poses(drop, assets, rng, arrangement="drop"):
+    """Draw start poses (N, 4, 4) of assets in the only region of a scene."""
+    return drop.start_poses.draw(drop.start_poses.items(assets), drop.static_scenes[0], rng, [arrangement])
+
+
 def lowest(mesh: trimesh.Trimesh, pose: NDArray[np.float64]) -> float:
     """Return the height of a placed mesh's lowest vertex [m]."""
     return float((mesh.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2].min())

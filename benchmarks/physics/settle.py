@@ -21,11 +21,11 @@ import argparse
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
@@ -35,6 +35,7 @@ from trimesh.creation import annulus, box, cylinder, torus
 
 from benchmarks.physics.layouts import POINT, time_layouts
 from benchmarks.record import figure, recording
+from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.decomposition import convex_pieces
@@ -46,6 +47,9 @@ from mitsplat.scene.layout import Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.contents import draw_objects
 from mitsplat.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from mitsplat.physics.drop import Drop
 
 STEPPERS = ("warp", "mujoco")
 WORKCELL = Path(__file__).resolve().parents[2] / "scenes/workcell.yaml"
@@ -219,6 +223,13 @@ def measure_bin(count: int) -> None:
         settle_all(f"40 objects in a bin, {stepper}", scene, count)
 
 
+def _start_poses(drop: Drop, assets: Sequence[int], seed: int) -> Float64Array:
+    """Draw start poses (N, 4, 4) of assets in the first region."""
+    arrangements = [possible[0] for _, possible in drop.scene.spec.all_regions]
+    items, rng = drop.start_poses.items(assets), np.random.default_rng(seed)
+    return drop.start_poses.draw(items, drop.static_scenes[0], rng, arrangements)
+
+
 def measure_rest(count: int) -> None:
     """Drop ten objects once for each of some seeds, without a second draw; then simulate five more seconds."""
     from mitsplat.physics.drop import drop_of
@@ -230,7 +241,7 @@ def measure_rest(count: int) -> None:
         for seed in range(count):
             assets, _ = draw_objects(drop.scene, 0)
             world = drop.world_of(assets, 1.0)
-            world.reset(drop.draw_poses(assets, np.random.default_rng(seed)))
+            world.reset(_start_poses(drop, assets, seed))
             outcome = run_to_rest(world, max_time=6.0, bounds=drop.static_scenes[0].bounds, free_time=FREE_TIME)
             if outcome.rejection:
                 print(f"  seed {seed}: {outcome.rejection}")
@@ -305,7 +316,7 @@ def measure_worlds(count: int, device: str) -> None:
     scene = make_scene(parts(), 2, "warp")
     drop = drop_of(scene, lambda text: None)
     assets, _ = draw_objects(drop.scene, 0)
-    starts = [drop.draw_poses(assets, np.random.default_rng(world)) for world in range(count)]
+    starts = [_start_poses(drop, assets, world) for world in range(count)]
     bodies = [drop.objects[asset].body for asset in assets]
     time_worlds(
         bodies,

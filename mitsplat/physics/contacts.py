@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from copy import copy
 from functools import cached_property
 from typing import Any
@@ -29,17 +29,18 @@ class ContactFinder:
     contacts do not depend on earlier models.
 
     Args:
-        pieces: Convex pieces of all objects that may be simulated. They are read when the first pipeline is made.
+        pieces: Function that returns the convex pieces of all objects that may be simulated. It is called for the first
+            pipeline, and again if it was interrupted.
     """
 
-    def __init__(self, pieces: Iterable[trimesh.Trimesh]) -> None:
+    def __init__(self, pieces: Callable[[], Iterable[trimesh.Trimesh]]) -> None:
         self._pieces = pieces
         self._narrow_phase: NarrowPhase | None = None
 
     @cached_property
     def _largest(self) -> newton.Mesh:
         """The hull of most vertices. With many vertices, the support search changes for all hulls: it decides."""
-        return newton_hull(max(self._pieces, key=lambda piece: len(piece.vertices)))
+        return newton_hull(max(self._pieces(), key=lambda piece: len(piece.vertices)))
 
     def pipeline(self, model: newton.Model, *, max_contacts: int) -> newton.CollisionPipeline:
         """Return a pipeline for a model of boxes and convex hulls.

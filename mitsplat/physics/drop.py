@@ -6,14 +6,14 @@ import gc
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.errors import InputError
-from mitsplat.physics.bodies import make_part
+from mitsplat.physics.bodies import Part, make_part
 from mitsplat.physics.certificate import RestingObject, RestingState
 from mitsplat.physics.handling import draw_handling
 from mitsplat.physics.mujoco_world import MujocoWorld
@@ -81,22 +81,27 @@ class _Rejection:
     simulated: float = 0.0
 
 
-@dataclass(frozen=True)
-class _Request:
-    """Cache key: the scene. The progress callback is excluded from equality."""
+@dataclass(eq=False)
+class _CachedDrop:
+    """Simulation of a scene that reports to the caller of the present call."""
 
     scene: Scene
-    progress: Note = field(compare=False)
+    progress: Note = discard_note
+
+    @cached_property
+    def drop(self) -> Drop:
+        """The simulation."""
+        return Drop(self.scene, lambda text: self.progress(text))
+
+
+_cached_drop = lru_cache(maxsize=1)(_CachedDrop)
 
 
 def drop_of(scene: Scene, progress: Note) -> Drop:
-    """Return the :class:`Drop` of a scene, cached for the last scene."""
-    return _make_drop(_Request(scene, progress))
-
-
-@lru_cache(maxsize=1)
-def _make_drop(request: _Request) -> Drop:
-    return Drop(request.scene, request.progress)
+    """Return the :class:`Drop` of a scene, cached for the last scene. It reports to the last ``progress``."""
+    cached = _cached_drop(scene)
+    cached.progress = progress
+    return cached.drop
 
 
 class Drop:
@@ -106,7 +111,7 @@ class Drop:
 
     Args:
         scene: Objects, start regions and colliders.
-        progress: Callback that receives a short description of a slow operation.
+        progress: Callback for slow operations, also when an asset is used for the first time.
 
     Attributes:
         scene: The scene.
@@ -119,8 +124,10 @@ class Drop:
         self.scene = scene
         self._worlds: dict[tuple[tuple[int, ...], float, int], World] = {}
         self._world_count = 0
-        meshes = {id(asset.mesh): asset for asset in reversed(scene.assets)}  # entries may share a mesh
-        parts = {key: make_part(asset, progress) for key, asset in meshes.items()}
+        parts: dict[int, Part] = {}
+        for asset in scene.assets:
+            if id(asset.mesh) not in parts:  # entries may share a mesh
+                parts[id(asset.mesh)] = make_part(asset, progress)
         self.objects = [parts[id(asset.mesh)] for asset in scene.assets]
         self.start_poses = StartPoses(scene, self.objects)
         self._surroundings = (scene.environments if scene.spec.environment_collides else ()) or (None,)
@@ -200,16 +207,6 @@ class Drop:
         """Return objects to place, with the given poses or else those of the scene file."""
         assets, regions = [one.asset for one in drawn], [one.region for one in drawn]
         return self.start_poses.items(assets, given or [one.given for one in drawn], regions)
-
-    def draw_poses(
-        self, assets: Sequence[int], rng: np.random.Generator, arrangements: Sequence[Arrangement] | None = None
-    ) -> Float64Array:
-        """Draw start poses of assets in the first region, see :meth:`StartPoses.draw`.
-
-        ``arrangements`` are those of all regions; the first of the scene file if None.
-        """
-        static, arrangements = self.static_scenes[0], arrangements or self._arrangements(())
-        return self.start_poses.draw(self.start_poses.items(assets), static, rng, arrangements)
 
     def _try(self, index: int, drawn: Sequence[_DrawnObject], refused: Sequence[str]) -> Layout | _Rejection:
         """Drop the given objects from the next draw of start poses."""

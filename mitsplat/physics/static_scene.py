@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +38,7 @@ class StaticScene:
 
 
 def make_static_scene(
-    scene: Scene, objects: Iterable[Part], surroundings: Asset | None, progress: Note, layout: int | None = None
+    scene: Scene, objects: Sequence[Part], surroundings: Asset | None, progress: Note, layout: int | None = None
 ) -> StaticScene:
     """Build the static scene from colliding shapes and, optionally, surroundings.
 
@@ -86,7 +86,7 @@ def make_static_scene(
     return StaticScene(
         tuple(colliders),
         tuple(obstacles),
-        ContactFinder(all_pieces((part.body for part in objects), colliders)),
+        ContactFinder(lambda: all_pieces((part.body for part in objects), colliders)),
         (outer_low, outer_high),
         (inner_low, inner_high),
     )

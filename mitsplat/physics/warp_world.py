@@ -46,7 +46,7 @@ class WarpWorld(World):
         self._solver.mjw_model.opt.warn_overflow = 0
         # The pipeline has room for one contact more than the solver, because it stops counting when it is full and sets
         # no flag.
-        finder = contact_finder or ContactFinder(all_pieces(bodies, colliders))
+        finder = contact_finder or ContactFinder(lambda: all_pieces(bodies, colliders))
         self._pipeline = finder.pipeline(model, max_contacts=contacts + 1)
         self._contacts = self._pipeline.contacts()
         self._states = model.state(), model.state()

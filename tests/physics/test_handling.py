@@ -14,7 +14,7 @@ from mitsplat.physics.settle import replay_layout, settle_layout, try_alone
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.contents import draw_arrangements
 from mitsplat.scene.spec.shape_spec import Region
-from tests.bodies import EVERYWHERE, GRAVITY, STEPPERS, body_of, pose_at, table, world_of
+from tests.bodies import EVERYWHERE, GRAVITY, STEPPERS, body_of, draw_start_poses, pose_at, table, world_of
 
 WAYS = ["tossed", "tipped", "pushed", "shaken"]
 EVERY = np.ones(1, dtype=bool)
@@ -206,7 +206,7 @@ def test_tipped_objects_start_close_together(scene_data, write_scene):
     scene_data["objects"] = [{"asset": "assets/nut", "count": 8}]
     drop, spread = drop_of(load_scene(write_scene(scene_data)), lambda text: None), {}
     for way in ("drop", "tipped"):
-        positions = drop.draw_poses((0,) * 8, np.random.default_rng(0), arrangements=[way])[:, :3, 3]
+        positions = draw_start_poses(drop, (0,) * 8, np.random.default_rng(0), way)[:, :3, 3]
         spread[way] = np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean()
     assert spread["tipped"] < 0.05 < 0.08 < spread["drop"]
 

@@ -14,6 +14,7 @@ from mitsplat.errors import InputError
 from mitsplat.physics.settle import replay_layout, settle_layout, settle_layouts, try_alone
 from mitsplat.scene.layout import Layout, UnsettledLayoutError
 from mitsplat.scene.loading.scene_loading import load_scene
+from tests.bodies import draw_start_poses
 from tests.conftest import box_asset
 
 pytestmark = pytest.mark.usefixtures("physics")
@@ -126,4 +127,4 @@ def test_a_region_mostly_inside_of_a_table_is_refused_with_its_name(scene_data, 
     rng = np.random.default_rng(0)
     scene_data["region"] = {"min": [-0.2, -0.2, -0.09], "max": [0.2, 0.2, 0.01]}
     with pytest.raises(InputError, match=r"in 0.4 x 0.4 x 0.1 m, (89|90|91)% of which are inside 'table', settle"):
-        drop_of(load_scene(write_scene(scene_data)), lambda text: None).draw_poses((0,), rng)
+        draw_start_poses(drop_of(load_scene(write_scene(scene_data)), lambda text: None), (0,), rng)

@@ -25,7 +25,7 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.layout_surroundings import draw_surroundings
 from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.spec.shape_spec import Region
-from tests.bodies import STEPPERS, lowest, pose_at
+from tests.bodies import STEPPERS, draw_start_poses, lowest, pose_at
 from tests.conftest import box_asset
 
 pytestmark = pytest.mark.usefixtures("physics")
@@ -58,7 +58,7 @@ def test_drawn_poses_are_uniform_and_do_not_overlap(scene_data, write_scene):
     rng = np.random.default_rng(0)
     rotations = []
     for _ in range(300):
-        poses = drop.draw_poses((0, 0, 1), rng)
+        poses = draw_start_poses(drop, (0, 0, 1), rng)
         rotations.append(poses[:, :3, :3])
         placed = [drop.start_poses.placed(asset, pose) for asset, pose in zip((0, 0, 1), poses, strict=True)]
         bounds = np.stack([item.bounds for item in placed])
@@ -309,6 +309,50 @@ def test_contact_shapes_are_made_for_the_assets_of_a_layout_only(monkeypatch: py
     flat = replace(boxes[0], mesh=trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2]]))
     with pytest.raises(InputError, match="must enclose a volume"):
         bodies.make_part(flat, lambda text: None)
+
+
+def test_notes_of_slow_operations_go_to_the_caller_of_the_present_call(scene_data, write_scene):
+    """Pieces are computed when an asset is used for the first time, which may be in a later layout."""
+    from mitsplat.physics.drop import drop_of
+
+    scene = load_scene(write_scene(scene_data))
+    scene = replace(scene, assets=tuple(replace(asset, pieces=()) for asset in scene.assets))
+    first, second = [], []
+    _ = drop_of(scene, first.append).objects[0].body
+    _ = drop_of(scene, second.append).objects[1].body
+    assert first == ["computing convex pieces of nut"]
+    assert second == ["computing convex pieces of bolt"]
+
+
+def test_an_interrupted_search_for_the_largest_hull_starts_again(scene_data, write_scene, monkeypatch):
+    """After Ctrl-C in a notebook, the next call finds the largest hull of all pieces."""
+    from mitsplat.physics import bodies
+    from mitsplat.physics.drop import Drop
+
+    drop = Drop(load_scene(write_scene(scene_data)), lambda text: None)
+    ball, calls = trimesh.creation.icosphere(subdivisions=1, radius=0.01), []
+
+    def pieces_of(pieces):
+        calls.append(pieces)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return (ball,) if len(calls) == 1 else tuple(pieces)
+
+    monkeypatch.setattr(bodies, "contact_pieces", pieces_of)
+    finder = drop.static_scenes[0].contact_finder
+    with pytest.raises(KeyboardInterrupt):
+        _ = finder._largest
+    assert len(finder._largest.vertices) == len(ball.vertices)
+
+
+def test_the_first_of_several_faulty_meshes_is_named(scene_data, write_scene):
+    from mitsplat.physics.drop import Drop
+
+    scene = load_scene(write_scene(scene_data))
+    sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], [[0, 1, 2]])
+    flat = tuple(replace(asset, mesh=sheet.copy(), pieces=()) for asset in scene.assets)
+    with pytest.raises(InputError, match="asset 'nut'"):
+        Drop(replace(scene, assets=flat), lambda text: None)
 
 
 @pytest.fixture

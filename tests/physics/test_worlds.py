@@ -137,7 +137,7 @@ def test_worlds_in_one_simulation_do_not_interact():
 
     alone = made(few, None)
     run_until(alone, 0.3)
-    finder = ContactFinder(all_pieces([*few, *many], [table()]))
+    finder = ContactFinder(lambda: all_pieces([*few, *many], [table()]))
     first, second = made(few, finder), made(many, finder)
     while first.time < 0.3 - 1e-9:
         first.advance()

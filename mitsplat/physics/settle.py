@@ -54,7 +54,7 @@ From other modules they import only types and values, and the values are hashed 
 _SIMULATION = ("mujoco", "mujoco-warp", "newton", "warp-lang")
 _TRIES_ALONE = 3
 """Drops of an object alone before it counts as one that does not come to rest."""
-LIBRARIES = ("coacd", "fast-simplification", "numpy", "scipy", "trimesh", *_SIMULATION)
+LIBRARIES = ("coacd", "fast-simplification", "manifold3d", "numpy", "scipy", "trimesh", *_SIMULATION)
 
 
 @one_at_a_time

@@ -74,6 +74,17 @@ def test_pieces_are_cached_and_damaged_cache_files_replaced(cache, bracket, capl
     assert "computed again" in caplog.text
 
 
+@pytest.mark.parametrize("library", ["coacd", "manifold3d"])
+def test_pieces_of_another_version_of_a_library_are_not_read(cache, bracket, monkeypatch, library):
+    decomposition._cached_pieces.cache_clear()
+    convex_pieces(bracket)
+    decomposition._cached_pieces.cache_clear()
+    version = decomposition.version
+    monkeypatch.setattr(decomposition, "version", lambda name: "other" if name == library else version(name))
+    convex_pieces(bracket)
+    assert len(list(cache.iterdir())) == 2
+
+
 def test_a_scan_without_a_triangle_is_closed_first():
     """CoACD would remesh an open mesh through voxels, which is slow and thickens the mesh."""
     ball = trimesh.creation.icosphere(3, 0.05)

@@ -7,6 +7,7 @@ import gc
 import hashlib
 import json
 import shutil
+import sys
 from dataclasses import replace
 from itertools import combinations
 from weakref import ref
@@ -208,6 +209,19 @@ def test_code_that_decides_layouts_is_hashed():
                 source = node.module.removeprefix("mitsplat.")
                 taken = {f"{source}.{name.name}" for name in node.names}
                 assert source in settle.MODULES or taken <= given, f"{module} takes {taken - given}"
+
+
+def test_versions_of_all_libraries_that_decide_layouts_are_hashed():
+    from mitsplat.physics import settle
+
+    imported = set()
+    for module in settle.MODULES:
+        for node in ast.walk(ast.parse((settle.PACKAGE / f"{module.replace('.', '/')}.py").read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) else []
+            imported |= {name.partition(".")[0] for name in names}
+    distributions = {"warp-lang" if name == "warp" else name for name in imported - sys.stdlib_module_names}
+    assert distributions - {"mitsplat"} <= {*settle.LIBRARIES}
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from mitsplat.scene import scene_json_schema
 
 DOCS = Path(__file__).parent
 _BEGIN = "<!-- Written by python docs/reference.py from here on -->\n\n"
-_PART = re.compile(f"(?<={re.escape(_BEGIN)}).*", re.DOTALL)
 
 
 def gallery() -> str:
@@ -59,8 +58,8 @@ def reference_pages() -> dict[Path, str]:
         "gallery.md": gallery(),
         "examples.md": scripts(),
     }
-    texts = {DOCS / name: (DOCS / name).read_text() for name in parts}
-    return {page: _PART.sub(lambda _, name=page.name: f"{parts[name]}\n", text) for page, text in texts.items()}
+    heads = {name: (DOCS / name).read_text().partition(_BEGIN)[0] for name in parts}
+    return {DOCS / name: f"{heads[name]}{_BEGIN}{part}\n" for name, part in parts.items()}
 
 
 def stale_pages() -> list[str]:

@@ -170,3 +170,5 @@ def test_a_page_that_differs_from_the_code_is_reported(tmp_path: Path, monkeypat
     page = tmp_path / "cli.md"
     page.write_text(page.read_text().replace("| `--spz` |", "| `--spzz` |"))
     assert reference.stale_pages() == ["cli.md"]
+    page.write_text("# Commands\n")  # the comment is missing
+    assert reference.stale_pages() == ["cli.md"]

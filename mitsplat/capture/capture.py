@@ -31,6 +31,7 @@ from mitsplat.geometry.lens import Lens
 from mitsplat.geometry.rigid import split_similarity
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.storage.content_hash import ContentHash
+from mitsplat.storage.field_types import Positive
 from mitsplat.storage.file_kinds import no_folder_with
 from mitsplat.storage.files import IMAGE_ERRORS, copy_file, resolve_inside, write_file, write_text
 from mitsplat.storage.format_version import FORMAT_VERSIONS
@@ -42,7 +43,6 @@ HELD_OUT_EVERY = 8
 CAPTURE_FILE = "capture.json"
 _POINTS = "points.npz"
 _Row = tuple[float, float, float, float]
-_Gain = Annotated[float, Field(gt=0)]
 
 
 class _Strict(BaseModel):
@@ -71,7 +71,7 @@ class PhotoSpec(_Strict):
     file: str = Field(min_length=1)
     mask: str | None = None
     camera: PhotoCamera
-    gain: tuple[_Gain, _Gain, _Gain] | None = Field(None, exclude_if=lambda gain: gain is None)
+    gain: tuple[Positive, Positive, Positive] | None = Field(None, exclude_if=lambda gain: gain is None)
 
 
 class CaptureSpec(_Strict):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -16,9 +16,9 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.storage.calibration_files import refuse_calibration
+from mitsplat.storage.field_types import Positive
 
 _Row = tuple[float, float, float, float]
-_Positive = Annotated[float, Field(gt=0)]
 POSES_RULE = "poses must be the folder of a COLMAP model or a transforms.json"
 _MAX_RATIO = 1.03
 """Maximum ratio of the focal lengths that two keys state."""
@@ -37,14 +37,14 @@ class _Lens(BaseModel):
 
     model_config = ConfigDict(allow_inf_nan=False, extra="allow")
 
-    camera_angle_x: _Positive | None = None
-    camera_angle_y: _Positive | None = None
-    fl_x: _Positive | None = None
-    fl_y: _Positive | None = None
+    camera_angle_x: Positive | None = None
+    camera_angle_y: Positive | None = None
+    fl_x: Positive | None = None
+    fl_y: Positive | None = None
     cx: float | None = None
     cy: float | None = None
-    w: _Positive | None = None
-    h: _Positive | None = None
+    w: Positive | None = None
+    h: Positive | None = None
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0

@@ -1,8 +1,6 @@
-"""Help texts of every command and option, and the entries of commands in the guide."""
+"""Help texts of every command and option."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import pytest
 import typer
@@ -27,12 +25,6 @@ def test_version_prints_the_version_of_the_package(capsys: pytest.CaptureFixture
 
     assert run("--version") == 0
     assert capsys.readouterr().out == f"mitsplat {version('mitsplat')}\n"
-
-
-def test_the_guide_lists_every_command() -> None:
-    page = (Path(__file__).parents[2] / "docs/first_dataset.md").read_text()
-    rows = [row.split()[2].rstrip("`") for row in page.splitlines() if row.startswith("| `mitsplat ")]
-    assert sorted(rows) == sorted(typer.main.get_command(app).commands)
 
 
 def test_help_lists_every_command_once_under_a_heading(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import newton
 import numpy as np
@@ -72,6 +73,12 @@ def all_pieces(bodies: Iterable[Body], colliders: Iterable[Collider]) -> Iterato
         yield from collider.pieces
 
 
+class _ContactShape(NamedTuple):
+    pieces: Sequence[trimesh.Trimesh]
+    hulls: tuple[trimesh.Trimesh, ...]  # the pieces for contacts, and their standoff [m]
+    standoff: float
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """Physics data of an asset. What takes long is computed at its first use: a layout has few assets of a large pool.
@@ -94,28 +101,25 @@ class Part:
     @cached_property
     def body(self) -> Body:
         """The rigid body."""
-        mass = mass_properties(self.mesh, self._pieces[0], density=self.asset.density, mass=self.asset.mass)
-        return Body(self._pieces[1], mass, _material(self.asset))
+        mass = mass_properties(self.mesh, self._shape.pieces, density=self.asset.density, mass=self.asset.mass)
+        return Body(self._shape.hulls, mass, _material(self.asset))
 
     @property
     def standoff(self) -> float:
         """Standoff of the body's pieces, see :func:`mitsplat.geometry.mesh_distance.standoff` [m]."""
-        return self._pieces[2]
+        return self._shape.standoff
 
     @cached_property
-    def _pieces(self) -> tuple[Sequence[trimesh.Trimesh], tuple[trimesh.Trimesh, ...], float]:
-        """Convex pieces, those for contacts, and the standoff of these [m]."""
-        if self.asset.pieces:
-            shape = contact_pieces(self.asset.pieces)
-            return self.asset.pieces, shape, standoff(self.surface, shape)
-        limit = max_gap(float(self.mesh.extents.max()))
-        for threshold in _CONCAVITIES:
-            pieces = _pieces(self.mesh, self.asset.name, self.progress, threshold=threshold)
-            shape = contact_pieces(pieces)
-            distance = standoff(self.surface, shape)
-            if distance <= limit:
+    def _shape(self) -> _ContactShape:
+        """The given pieces, or the coarsest convex pieces within the limit, else the finest."""
+        mesh, asset, limit = self.mesh, self.asset, max_gap(float(self.mesh.extents.max()))
+        finer = (_pieces(mesh, asset.name, self.progress, threshold=threshold) for threshold in _CONCAVITIES)
+        for pieces in [asset.pieces] if asset.pieces else finer:
+            hulls = contact_pieces(pieces)
+            shape = _ContactShape(pieces, hulls, standoff(self.surface, hulls))
+            if shape.standoff <= limit:
                 break
-        return pieces, shape, distance
+        return shape
 
 
 def make_body(asset: Asset, progress: Note) -> Body:

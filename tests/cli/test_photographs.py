@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -198,32 +199,28 @@ def test_asset_and_mesh_read_the_lights_of_the_photos(
     assert "lights and a given material both define the materials: omit one of the two" in capsys.readouterr().err
 
 
-def test_a_log_has_stages_and_the_remaining_time(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The log replaces the progress bar if standard error is no terminal."""
-    clock = iter([0.0, 5.0, 70.0, 80.0, 90.0])
-    monkeypatch.setattr("mitsplat.cli.console.time.monotonic", lambda: next(clock))
-    with stage_bar() as progress:
-        progress(0, 10, "matching")
-        progress(1, 10, "matching")
-        progress(5, 10, "matching")
-        progress(1, 4, "fitting: 20.0 dB")
-        progress(2, 4, "fitting: 21.0 dB")
-    told = capsys.readouterr().err.splitlines()
+@pytest.fixture
+def log_of(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+    """Return a function that reports steps at given times [s] and returns the log, which replaces the bar in a file."""
+
+    def log(times: Sequence[float], *steps: tuple[int, int, str]) -> list[str]:
+        clock = iter(times)
+        monkeypatch.setattr("mitsplat.cli.console.time.monotonic", lambda: next(clock))
+        with stage_bar() as progress:
+            for step in steps:
+                progress(*step)
+        return capsys.readouterr().err.splitlines()
+
+    return log
+
+
+def test_a_log_has_stages_and_the_remaining_time(log_of: Callable[..., list[str]]) -> None:
+    matching = [(done, 10, "matching") for done in (0, 1, 5)]
+    told = log_of([0.0, 5.0, 70.0, 80.0, 90.0], *matching, (1, 4, "fitting: 20.0 dB"), (2, 4, "fitting: 21.0 dB"))
     assert told == ["  0 %: matching", " 50 %: matching, 70 s left", " 25 %: fitting: 20.0 dB"]
 
 
-def test_a_log_states_no_remaining_time_at_the_start_of_a_stage(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_states_no_remaining_time_at_the_start_of_a_stage(log_of: Callable[..., list[str]]) -> None:
     """The first step of segmentation takes a minute for all photos, and the other steps a second each."""
-    clock = iter([0.0, 62.0, 63.0, 124.0])
-    monkeypatch.setattr("mitsplat.cli.console.time.monotonic", lambda: next(clock))
-    with stage_bar() as progress:
-        progress(1, 30, "cutting out")
-        progress(2, 30, "cutting out")
-        progress(3, 30, "cutting out")
-        progress(25, 30, "cutting out")
-    told = capsys.readouterr().err.splitlines()
+    told = log_of([0.0, 62.0, 63.0, 124.0], *[(done, 30, "cutting out") for done in (1, 2, 3, 25)])
     assert told == ["  3 %: cutting out", "  6 %: cutting out", " 83 %: cutting out, 26 s left"]

@@ -63,7 +63,7 @@ def _fault(path: Path, link: str) -> str | None:
     target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
     if not target.exists() or not (target.is_relative_to(ROOT) or path.suffix == ".html"):
         return "leads to no file"
-    if not parts.fragment or target.suffix not in (".html", ".md") or "<!-- generated:" in target.read_text():
+    if not parts.fragment or target.suffix not in (".html", ".md"):
         return None
     return None if unquote(parts.fragment) in _page(target).anchors else "leads to no such place"
 

@@ -1,6 +1,7 @@
 """Writes the generated parts of pages: ``python docs/reference.py [--check]``.
 
-These are the scene keys, the commands, the gallery and the example scripts. The part of a page is below its comment.
+These are the scene keys, the commands, the Python names, the gallery and the example scripts. The part of a page is
+below its comment.
 ``--check`` writes nothing, and exits with status 1 if a page differs from the code.
 """
 
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from cli_reference import cli_reference
 from pictures import GALLERY, SCENES, SHEETS
+from python_reference import api_reference, package_reference, plugin_reference
 from scene_reference import scene_reference
 
 from mitsplat.scene import scene_json_schema
@@ -55,6 +57,9 @@ def reference_pages() -> dict[Path, str]:
     parts = {
         "scene.md": scene_reference(scene_json_schema()),
         "cli.md": cli_reference(),
+        "api.md": api_reference(),
+        "packages.md": package_reference(),
+        "plugins.md": plugin_reference(),
         "gallery.md": gallery(),
         "examples.md": scripts(),
     }

@@ -90,10 +90,10 @@ def _section(root: Schema, path: str, model: Schema, pictures: dict[str, list[Pi
     where, _, kind = path.partition(" of kind ")
     title = _title(path)
     level = "##" if not kind and "." not in path else "###"
-    parts = [f"{level} {title}", _markdown(model.get("description", ""))]
+    parts = [f"{level} {title}", to_markdown(model.get("description", ""))]
     if "oneOf" in model:
         rows = [
-            (f"[`{one['properties']['kind']['const']}`](#{_anchor(root, path, one)})", _in_a_row(one["description"]))
+            (f"[`{one['properties']['kind']['const']}`](#{_anchor(root, path, one)})", in_a_row(one["description"]))
             for one in _kinds(root, model)
         ]
         return "\n\n".join([*parts, markdown_table(("kind", "meaning"), rows)])
@@ -111,7 +111,7 @@ def _row(root: Schema, name: str, full: str, key: Schema, *, required: bool) -> 
     value = _type_of(root, _item(key), full + ("[]" if _item(key) is not key else ""))
     if _item(key) is not key:
         value = f"list of {_plural(value)}"
-    text = _in_a_row(key.get("description") or _resolved(root, _item(key)).get("description", ""))
+    text = in_a_row(key.get("description") or _resolved(root, _item(key)).get("description", ""))
     # A unit that is stated once belongs to the value.
     if len(units := re.findall(r" \[([a-zA-Z/^0-9]+)\]", text)) == 1 and "number" in value and not value.endswith("`"):
         value, text = f"{value} [{units[0]}]", text.replace(f" [{units[0]}]", "")
@@ -250,11 +250,11 @@ def _slug(title: str) -> str:
     return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 
-def _markdown(text: str) -> str:
+def to_markdown(text: str) -> str:
     """Convert the reStructuredText of a docstring to Markdown."""
-    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text).replace("``", "`")
+    return re.sub(r":\w+:`~?\.?([^`]+)`", r"`\1`", text).replace("``", "`")
 
 
-def _in_a_row(text: str) -> str:
+def in_a_row(text: str) -> str:
     """Convert a docstring to one line of Markdown: its first paragraph."""
-    return " ".join(_markdown(text).split("\n\n", 1)[0].split()).replace("|", "\\|")
+    return " ".join(to_markdown(text).split("\n\n", 1)[0].split()).replace("|", "\\|")

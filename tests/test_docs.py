@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -160,13 +162,54 @@ def test_every_command_option_and_scene_key_is_in_a_row_of_the_reference_pages()
         assert any(f"\n| `{name}` | " in part for part in sections), key
 
 
+def test_every_public_name_is_in_one_task_with_its_signature() -> None:
+    from python_reference import TASKS
+
+    import mitsplat
+
+    names = [name for task in TASKS.values() for name in task]
+    assert sorted(names) == mitsplat.__all__
+    sections = (DOCS / "api.md").read_text().split("\n### ")
+    for task, listed in TASKS.items():
+        (section,) = (part for part in sections if part.partition("\n")[0] == task)
+        assert re.findall(r"^(?:def|class) (\w+)", section, re.MULTILINE) == list(listed)
+
+
+def test_every_package_that_exports_names_has_a_section_with_them() -> None:
+    sections = (DOCS / "packages.md").read_text().split("\n## ")[1:]
+    rows = {
+        part.partition("\n")[0].strip("`"): re.findall(r"^\| `(\w+)` \| \S", part, re.MULTILINE) for part in sections
+    }
+    assert {"mitsplat.scene", "mitsplat.renderer", "mitsplat.importing"} <= set(rows)
+    for package in sorted((DOCS.parent / "mitsplat").glob("*/**/__init__.py")):
+        name = ".".join(package.parent.relative_to(DOCS.parent).parts)
+        exported = getattr(importlib.import_module(name), "__all__", None)
+        assert rows.get(name) == exported, name
+
+
+@pytest.mark.parametrize("plugin", ["splats", "splat_proxy", "opencv_camera"])
+def test_every_plugin_parameter_is_in_a_row_of_its_manual(plugin: str) -> None:
+    source = (DOCS.parent / f"plugins/{plugin}.py").read_text()
+    read = set(re.findall(r"^     \* - (.*)$", source, re.MULTILINE))
+    section = (DOCS / "plugins.md").read_text().partition(f"## `{plugin}`")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `(.*?)` \| (\w[\w ]*) \| (.*) \| (\S.*) \|$", section, re.MULTILINE)
+    assert {row[0].replace("`", "") for row in rows} == read
+    assert "::" not in section and "(Default" not in section
+
+
 def test_a_page_that_differs_from_the_code_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import reference
 
-    for name in ("scene.md", "cli.md", "gallery.md", "examples.md"):
-        (tmp_path / name).write_text((DOCS / name).read_text())
+    pages = list(reference.reference_pages())
+    for page in pages:
+        (tmp_path / page.name).write_text(page.read_text())
     monkeypatch.setattr(reference, "DOCS", tmp_path)
     assert reference.stale_pages() == []
+    for page in pages:
+        (tmp_path / page.name).write_text(page.read_text() + "one line more\n")
+    assert reference.stale_pages() == [page.name for page in pages]
+    for page in pages:
+        (tmp_path / page.name).write_text(page.read_text())
     page = tmp_path / "cli.md"
     page.write_text(page.read_text().replace("| `--spz` |", "| `--spzz` |"))
     assert reference.stale_pages() == ["cli.md"]

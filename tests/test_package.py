@@ -26,12 +26,6 @@ def test_public_names_are_sorted_and_importable() -> None:
         mitsplat.no_such_name  # noqa: B018
 
 
-def test_the_compatibility_page_names_every_public_name() -> None:
-    page = (ROOT / "docs/compatibility.md").read_text()
-    names = page.partition("### Public names")[2].partition("### Layers")[0]
-    assert re.findall(r"^\| `(\w+)` \|", names, re.MULTILINE) == list(mitsplat.__all__)
-
-
 def test_the_compatibility_page_names_every_layer() -> None:
     ensure_variant()
     from mitsplat.plugins.splat_proxy import AOVS

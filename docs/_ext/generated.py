@@ -1,11 +1,11 @@
-"""Fills in what is generated: a page says where by a comment such as ``<!-- generated: api -->``.
+"""Replaces summaries of code by docstrings, and comments by files, while Sphinx reads the pages.
 
-So the pages stay readable where nothing is built, and what they say of the code cannot be out of date.
+The comment ``<!-- generated: api TASK -->`` or ``<!-- generated: package NAME -->`` precedes a summary, which ends at
+the next heading. The pages are readable where nothing is built.
 """
 
 from __future__ import annotations
 
-import ast
 import importlib
 import importlib.util
 import inspect
@@ -15,37 +15,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from docutils import nodes
+from python_reference import TASKS
 from sphinx.application import Sphinx
 from sphinx.domains.python import PyObject
 
-ROOT = Path(__file__).parents[2]
-PACKAGES = (
-    *(
-        "scene",
-        "scene.spec",
-        "physics",
-        "renderer",
-        "labels",
-        "frames",
-        "formats",
-        "dataset",
-        "engine",
-        "audit",
-        "report",
-        "detector",
-    ),
-    *(
-        "capture",
-        "capture.video",
-        "capture.boards",
-        "capture.alignment",
-        "capture.lighting",
-        "fit",
-        "reconstruct",
-        "bake",
-        "checks",
-    ),
-)
+import mitsplat
 
 
 def _included(path: str) -> str:
@@ -54,60 +28,39 @@ def _included(path: str) -> str:
     return f"```{{literalinclude}} ../{path}\n:language: {language}\n```"
 
 
-def _api() -> str:
-    """The names that ``import mitsplat as ms`` gives."""
-    import mitsplat
-
-    return "\n\n".join(_documented("mitsplat", name) for name in mitsplat.__all__)
+def _api(task: str) -> str:
+    """Return the docstrings of the public names of a task."""
+    return "\n\n".join(_documented("mitsplat", name) for name in TASKS[task])
 
 
-def _packages() -> str:
-    """Public names of the packages that ``mitsplat`` itself does not export."""
-    import mitsplat
-
-    sections = []
-    for package in PACKAGES:
-        module = importlib.import_module(f"mitsplat.{package}")
-        sections.append(
-            f"## `mitsplat.{package}`\n\n```{{eval-rst}}\n.. automodule:: mitsplat.{package}\n   :no-members:\n```"
-        )
-        public = [name for name in module.__all__ if name in mitsplat.__all__]
-        if public:
-            sections.append("Also exports " + ", ".join(f"{{py:obj}}`mitsplat.{name}`" for name in public) + ".")
-        sections += [_documented(f"mitsplat.{package}", name) for name in module.__all__ if name not in public]
-    return "\n\n".join(sections)
+def _package(package: str) -> str:
+    """Return the docstrings of a package and of its names; those of ``mitsplat`` itself are linked."""
+    module = importlib.import_module(f"mitsplat.{package}")
+    parts = [f"```{{eval-rst}}\n.. automodule:: mitsplat.{package}\n   :no-members:\n```"]
+    public = [name for name in module.__all__ if name in mitsplat.__all__]
+    if public:
+        parts.append("Also exports " + ", ".join(f"{{py:obj}}`mitsplat.{name}`" for name in public) + ".")
+    return "\n\n".join(
+        [*parts, *(_documented(f"mitsplat.{package}", name) for name in module.__all__ if name not in public)]
+    )
 
 
 def _documented(module: str, name: str) -> str:
     value = getattr(importlib.import_module(module), name)
-    kind = "class" if inspect.isclass(value) else "function" if inspect.isfunction(value) else "data"
-    # What a pydantic model holds is told by the reference of scene files.
+    kind = "class" if inspect.isclass(value) else "function"
+    # The page of the scene keys describes the fields of pydantic models.
     members = "   :members:\n" if kind == "class" and not hasattr(value, "model_fields") else ""
     return f"```{{eval-rst}}\n.. auto{kind}:: {module}.{name}\n{members}```"
 
 
-def _plugins() -> str:
-    """The docstrings of the plugins, which are their manuals as Mitsuba's are."""
-    sections = []
-    for path in (ROOT / "plugins" / f"{name}.py" for name in ("splats", "splat_proxy", "opencv_camera")):
-        classes = (node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ClassDef))
-        manual = next(text for node in classes if ":monosp:" in (text := ast.get_docstring(node) or ""))
-        manual = re.sub(r"\|(\w+)\|", r"\1", manual)  # |string| and the like, which Mitsuba's documentation replaces
-        sections.append(f"## `{path.stem}`\n\n```{{eval-rst}}\n{manual}\n```")
-    return "\n\n".join(sections)
-
-
-GENERATED: dict[str, Callable[[], str]] = {
-    "api": _api,
-    "packages": _packages,
-    "plugins": _plugins,
-}
+GENERATED: dict[str, Callable[[str], str]] = {"api": _api, "package": _package}
 
 
 def _fill_in(app: Sphinx, docname: str, source: list[str]) -> None:
     if docname.startswith("examples/"):
         return
-    source[0] = re.sub(r"<!-- generated: (\w+) -->", lambda match: GENERATED[match[1]](), source[0])
+    pattern = r"<!-- generated: (\w+) (.+?) -->.*?(?=\n###? |\Z)"
+    source[0] = re.sub(pattern, lambda match: GENERATED[match[1]](match[2]), source[0], flags=re.DOTALL)
     source[0] = re.sub(r"<!-- included: (\S+) -->", lambda match: _included(match[1]), source[0])
 
 

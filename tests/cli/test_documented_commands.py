@@ -90,8 +90,8 @@ module.asset_from_photos = small
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    """Return the code blocks of a page in one language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    """Return the code blocks of a page in one language, without generated signatures, which follow a comment."""
+    return re.findall(rf"(?<!-->\n\n)^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
 def commands(page: Path) -> list[list[str]]:

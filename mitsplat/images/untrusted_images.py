@@ -72,7 +72,7 @@ def _read_images(output: BinaryIO, _: bytes, *arguments: str) -> None:
     mi.set_variant("scalar_rgb")
     ensure_threads()
     for path, limit in zip(arguments[::2], arguments[1::2], strict=True):
-        limit_memory(int(limit))
+        limit_memory(int(limit), final=False)
         check_exr_header(Path(path))
         try:
             mi.Bitmap(path)

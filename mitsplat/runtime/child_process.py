@@ -137,7 +137,7 @@ def run_function() -> None:
     data = sys.stdin.buffer.read()
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # libraries print to stdout
-    limit_memory(int(memory), final=True)
+    limit_memory(int(memory))
     try:
         function(output, data, *arguments)
         output.flush()
@@ -149,13 +149,18 @@ def run_function() -> None:
     os._exit(0)  # with limited memory, the shutdown of a driver may hang
 
 
-def limit_memory(memory: int, *, final: bool = False) -> None:
-    """Limit a child's address space to its present size plus ``memory`` [bytes]; no later limit exceeds a final one."""
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    bound = _address_space() + memory
-    if most != resource.RLIM_INFINITY:
-        bound = min(bound, most)
-    resource.setrlimit(resource.RLIMIT_AS, (bound, bound if final else most))
+def limit_memory(memory: int, *, final: bool = True) -> None:
+    """Limit a child's address space to its present size plus ``memory`` [bytes].
+
+    Args:
+        memory: Additional address space [bytes].
+        final: True keeps a lower limit of the user, and no later limit exceeds this one. False replaces the limit of an
+            earlier part of the work.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    present = (soft, hard) if final else (hard,)
+    bound = min([_address_space() + memory, *(limit for limit in present if limit != resource.RLIM_INFINITY)])
+    resource.setrlimit(resource.RLIMIT_AS, (bound, bound if final else hard))
 
 
 def _address_space() -> int:

@@ -1,6 +1,7 @@
 """Python child processes: isolation from the current folder, memory and time limits, and errors."""
 
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -38,7 +39,7 @@ def fill(output, data, amount):
 
 
 def fill_twice(output, data, small, large):
-    limit_memory(int(small) * 2)
+    limit_memory(int(small) * 2, final=False)
     bytearray(int(small))
     output.write(b"small ")
     output.flush()
@@ -47,7 +48,7 @@ def fill_twice(output, data, small, large):
 
 
 def exceed(output, data, amount):
-    limit_memory(4 * int(amount))
+    limit_memory(4 * int(amount), final=False)
     bytearray(int(amount))
 
 
@@ -64,6 +65,12 @@ def show_settings(output, data):
 
     values = sys.flags.safe_path, os.environ[SAFE_PATH], resource.getrlimit(resource.RLIMIT_CORE)
     output.write(repr(values).encode())
+
+
+def show_memory(output, data):
+    import resource
+
+    output.write(repr(resource.getrlimit(resource.RLIMIT_AS)).encode())
 
 
 class TestBounded:
@@ -91,6 +98,17 @@ class TestBounded:
     def test_the_function_cannot_raise_the_bound(self):
         ended = run_bounded(exceed, str(GIB), memory=GIB // 2, seconds=30)
         assert ended == (1, b"", "MemoryError")
+
+    def test_a_lower_limit_of_the_user_stays(self):
+        """A shell limits its children by ``ulimit -S -v``, which a process may raise to the hard limit."""
+        code = (
+            "import resource\n"
+            "from tests.runtime.test_child_process import GIB, run_bounded, show_memory\n"
+            "resource.setrlimit(resource.RLIMIT_AS, (8 * GIB, resource.RLIM_INFINITY))\n"
+            "print(run_bounded(show_memory, memory=32 * GIB, seconds=30).output.decode())"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout == f"({8 * GIB}, {8 * GIB})\n"
 
     def test_a_signal_is_reported_by_its_number(self):
         assert run_bounded(die, memory=GIB, seconds=30) == (-6, b"", "stopped with status -6")

@@ -15,7 +15,7 @@ from newton.solvers import SolverMuJoCo
 
 from mitsplat.arrays import Float64Array
 from mitsplat.physics.friction import GRAVITY, MIN_FRICTION
-from mitsplat.physics.restitution import IMPACT_IMPEDANCE, MIN_IMPACT_SPEED, SIMULTANEOUS, rebound_speed_on_warp
+from mitsplat.physics.restitution import IMPACT_IMPEDANCE, MIN_IMPACT_SPEED, SIMULTANEOUS, impact_damping_on_warp
 
 _MIN_SLIDING_WARP = 1e-4  # at 2e-5, blocks with rolling friction diverge in single precision
 _vec5 = wp.types.vector(length=5, dtype=wp.float32)
@@ -36,7 +36,7 @@ class PairContactSolver(SolverMuJoCo):
         if self._rebounds:
             nbody = self.mjw_model.nbody
             self._longest: Any = wp.zeros((self.mjw_data.nworld, nbody * nbody), dtype=wp.float32, device=model.device)
-            self._approach = wp.zeros(self.mjw_data.naconmax, dtype=wp.float32, device=model.device)
+            self._impacts = wp.zeros(self.mjw_data.naconmax, dtype=wp.vec2, device=model.device)
             self._velocities = wp.zeros_like(self.mjw_data.qvel)
 
     def geom_restitution(self) -> Float64Array:
@@ -60,7 +60,7 @@ class PairContactSolver(SolverMuJoCo):
         model_bodies = [self.mjw_model.geom_bodyid, self.mjw_model.nbody]
         bodies = [model.shape_body, state_in.body_q, state_in.body_qd, model.body_com]
         shapes = [self.mjc_geom_to_newton_shape, model.shape_material_restitution]
-        impacts, timestep = [self._approach, self._longest], self.mjw_model.opt.timestep
+        impacts, timestep = [self._impacts, self._longest], self.mjw_model.opt.timestep
         self._longest.fill_(0.0)
         wp.copy(self._velocities, self.mjw_data.qvel)
         wp.launch(
@@ -129,10 +129,10 @@ def _find_impacts(
     frame: wp.array[wp.mat33],
     dist: wp.array[wp.float32],
     timestep: wp.array[wp.float32],
-    approach: wp.array[wp.float32],
+    impacts: wp.array[wp.vec2],
     longest: wp.array2d[wp.float32],
 ):
-    """Compute the approach speed of each impact, else 0, and the longest time of each pair below the surface."""
+    """Compute approach speed and time since each impact, else 0, and the longest time of each pair of bodies."""
     contact = wp.tid()
     if contact >= count[0]:
         return
@@ -143,11 +143,11 @@ def _find_impacts(
         _point_velocity(shape_body[first], pos[contact], body_q, body_qd, body_com)
         - _point_velocity(shape_body[second], pos[contact], body_q, body_qd, body_com),
     )
-    approach[contact] = 0.0
+    impacts[contact] = wp.vec2(0.0)
     if restitution[first] * restitution[second] > 0.0 and speed > MIN_IMPACT_SPEED:
-        approach[contact] = speed
-        place = _pair_index(geom_body[pair[0]], geom_body[pair[1]], nbody)
-        wp.atomic_max(longest, world, place, wp.clamp(-dist[contact] / speed, 0.0, timestep[0]))
+        since = wp.clamp(-dist[contact] / speed, 0.0, timestep[0])
+        impacts[contact] = wp.vec2(speed, since)
+        wp.atomic_max(longest, world, _pair_index(geom_body[pair[0]], geom_body[pair[1]], nbody), since)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -160,7 +160,7 @@ def _rebound(
     nbody: int,
     geom_shape: wp.array2d[wp.int32],
     restitution: wp.array[wp.float32],
-    approach: wp.array[wp.float32],
+    impacts: wp.array[wp.vec2],
     longest: wp.array2d[wp.float32],
     timestep: wp.array[wp.float32],
     frame: wp.array[wp.mat33],
@@ -169,23 +169,22 @@ def _rebound(
     solreffriction: wp.array[wp.vec2],
     solimp: wp.array[_vec5],
 ):
-    """Give impacts the reference acceleration of :func:`mitsplat.physics.restitution.rebound_speed`, as damping."""
+    """Give impacts the damping of :func:`mitsplat.physics.restitution.impact_damping`."""
     contact = wp.tid()
     if contact >= count[0]:
         return
-    speed = approach[contact]
+    speed, since = impacts[contact][0], impacts[contact][1]
     if speed == 0.0:
         return
     pair, world = geoms[contact], worlds[contact]
-    since = wp.clamp(-dist[contact] / speed, 0.0, timestep[0])
     place = _pair_index(geom_body[pair[0]], geom_body[pair[1]], nbody)
     if since < longest[world, place] - SIMULTANEOUS:
         dist[contact] = 1.0  # no force in this step
         return
     e = wp.sqrt(restitution[geom_shape[world, pair[0]]] * restitution[geom_shape[world, pair[1]]])
-    rebound = rebound_speed_on_warp(e, speed, since, GRAVITY * wp.abs(frame[contact][0][2]), timestep[0])
+    damping = impact_damping_on_warp(e, speed, since, GRAVITY * wp.abs(frame[contact][0][2]), timestep[0])
     solreffriction[contact] = solref[contact]  # sliding does not rebound
-    solref[contact] = wp.vec2(0.0, -(speed + rebound) / (speed * timestep[0]))
+    solref[contact] = wp.vec2(0.0, -damping)
     solimp[contact] = _vec5(IMPACT_IMPEDANCE, IMPACT_IMPEDANCE, 1.0e-3, 0.5, 2.0)
 
 

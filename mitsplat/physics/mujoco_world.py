@@ -13,7 +13,7 @@ from mitsplat.physics.bodies import Body, Collider
 from mitsplat.physics.contact_solver import PairContactSolver
 from mitsplat.physics.friction import GRAVITY, pair_friction
 from mitsplat.physics.newton_model import IMPEDANCE_MUJOCO, SOLVER_OPTIONS, WITHOUT_ROLL, build_model
-from mitsplat.physics.restitution import IMPACT_IMPEDANCE, MIN_IMPACT_SPEED, SIMULTANEOUS, rebound_speed
+from mitsplat.physics.restitution import IMPACT_IMPEDANCE, MIN_IMPACT_SPEED, SIMULTANEOUS, impact_damping
 from mitsplat.physics.worlds import STEPS, ContactOverflow, World
 
 _logger = logging.getLogger(__name__)
@@ -128,9 +128,9 @@ class MujocoWorld(World):
         np.maximum.at(late, bodies, since[:, None])
         contact.exclude[fast] = since < longest[pair] - SIMULTANEOUS  # no force in this step
         gravity = GRAVITY * np.abs(contact.frame[fast, 2])
-        rebound = rebound_speed(restitution[fast], approach, since, gravity, timestep)
         contact.solreffriction[fast] = contact.solref[fast]  # sliding does not rebound
-        contact.solref[fast] = np.stack([np.zeros(len(fast)), -(approach + rebound) / (approach * timestep)], axis=1)
+        contact.solref[fast, 0] = 0.0
+        contact.solref[fast, 1] = -impact_damping(restitution[fast], approach, since, gravity, timestep)
         contact.solimp[fast, :2] = IMPACT_IMPEDANCE
         return late
 

@@ -46,22 +46,23 @@ IMPACT_IMPEDANCE = 0.9999
 """Impedance of impacts: the largest of MuJoCo, so that a contact reaches its reference acceleration."""
 
 
-def rebound_speed(restitution: Any, approach: Any, since: Any, gravity: Any, timestep: Any) -> Any:
-    """Compute the separation speeds of impacts [m/s]; see :mod:`mitsplat.physics.restitution`.
+def impact_damping(restitution: Any, approach: Any, since: Any, gravity: Any, timestep: Any) -> Any:
+    """Compute the damping ``b = (v + w) / (v h)`` of impacts [1/s]; see :mod:`mitsplat.physics.restitution`.
 
-    The arguments are arrays of NumPy, shape (N,), or numbers of a kernel in :data:`rebound_speed_on_warp`.
+    The arguments are arrays of NumPy, shape (N,), or numbers of a kernel in :data:`impact_damping_on_warp`.
 
     Args:
         restitution: Coefficients of the contacts.
-        approach: Approach speeds [m/s].
-        since: Times since the impacts [s].
+        approach: Approach speeds ``v`` [m/s].
+        since: Times ``t`` since the impacts [s].
         gravity: Gravity along the normals [m/s^2].
-        timestep: Timestep [s].
+        timestep: Timestep ``h`` [s].
     """
     half = 0.5 * gravity * (timestep + 2.0 * since)
     energy = restitution * restitution * approach * (approach + gravity * (timestep - 2.0 * since))
-    return np.sqrt(half * half + energy) - half
+    rebound = np.sqrt(half * half + energy) - half
+    return (approach + rebound) / (approach * timestep)
 
 
-rebound_speed_on_warp = wp.func(rebound_speed)
-"""Function of a kernel that computes :func:`rebound_speed`."""
+impact_damping_on_warp = wp.func(impact_damping)
+"""Function of a kernel that computes :func:`impact_damping`."""

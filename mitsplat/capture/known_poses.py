@@ -79,6 +79,28 @@ def read_poses(
             whether a camera holds for a photo before or after its EXIF rotation.
         MissingResourceError: If COLMAP aborts its process.
     """
+    model, matched, sized = _read_model(source, photos, folder, base, unusable)
+    _check_coordinates(source, model)
+    for remark in _lens_remarks(model, matched):
+        _logger.warning("%s: %s", source, remark)
+    upright = _upright_photos(source, model, matched, sized)
+    matched |= {name: turn_upright(photo) for name, photo in matched.items() if photo.name in upright}
+    cameras = {
+        photo.file.name: _resized_camera(source, name, model.cameras[name], photo.size)
+        for name, photo in matched.items()
+    }
+    turned = {photo.name: photo for photo in matched.values()}
+    photos = [turned.get(photo.name, photo) for photo in photos]
+    if not len(model.points):
+        return find_points([p for p in photos if p.file.name in cameras], cameras, folder, progress), photos
+    seen = {photo.file.name: model.seen[name] for name, photo in matched.items()}
+    return replace(model, cameras=cameras, seen=seen), photos
+
+
+def _read_model(
+    source: Path, photos: Sequence[Prepared], folder: Path, base: Path, unusable: Sequence[str]
+) -> tuple[SparseModel, dict[str, Prepared], set[str]]:
+    """Return the model of a file, its photos by the names in the file, and the names whose image size is stated."""
     by_name = {photo.name: photo for photo in photos}
     everything = [*by_name, *unusable]
     if source.is_dir():
@@ -103,21 +125,7 @@ def read_poses(
         first = next(iter(paths))
         named = f"it names {first}, and a photo is {next(iter(everything), 'missing')}"
         raise InputError(f"{source}: must name at least two of the photos (got {len(matched)}; {named})")
-    _check_coordinates(source, model)
-    for remark in _lens_remarks(model, matched):
-        _logger.warning("%s: %s", source, remark)
-    upright = _upright_photos(source, model, matched, sized)
-    matched |= {name: turn_upright(photo) for name, photo in matched.items() if photo.name in upright}
-    cameras = {
-        photo.file.name: _resized_camera(source, name, model.cameras[name], photo.size)
-        for name, photo in matched.items()
-    }
-    turned = {photo.name: photo for photo in matched.values()}
-    photos = [turned.get(photo.name, photo) for photo in photos]
-    if not len(model.points):
-        return find_points([p for p in photos if p.file.name in cameras], cameras, folder, progress), photos
-    seen = {photo.file.name: model.seen[name] for name, photo in matched.items()}
-    return replace(model, cameras=cameras, seen=seen), photos
+    return model, matched, sized
 
 
 def unnamed_photos(source: Path, photos: Sequence[str], base: Path) -> list[str]:

@@ -95,17 +95,7 @@ def run_frames(
     helpers = min(len(later), _affordable_helpers(max_workers, memory)) if worthwhile else 0
     serial = total <= 1 or max_workers + helpers <= 1 or (workers is None and total <= _MAX_SERIAL_FRAMES)
     if serial and (device is None or device.is_usable_here):
-        if device is not None and device != current_device():
-            use_device(device)
-        for frames in layouts.values():
-            for index in frames:
-                try:
-                    made = make(index, note)
-                except (RuntimeError, MemoryError) as error:
-                    if is_out_of_memory(error):
-                        raise memory_error(index, sentence_of(error)) from error
-                    raise
-                yield made
+        yield from _make_here(make, layouts, note, device)
         return
     if serial:
         max_workers = 1
@@ -129,6 +119,23 @@ def run_frames(
             for _ in range(helpers):
                 pool.start_helper()
             yield from found
+
+
+def _make_here(
+    make: MakeFrame[Result], layouts: Mapping[int, Sequence[int]], note: Note, device: Device | None
+) -> Generator[Result]:
+    """Make the frames one after the other in this process."""
+    if device is not None and device != current_device():
+        use_device(device)
+    for frames in layouts.values():
+        for index in frames:
+            try:
+                made = make(index, note)
+            except (RuntimeError, MemoryError) as error:
+                if is_out_of_memory(error):
+                    raise memory_error(index, sentence_of(error)) from error
+                raise
+            yield made
 
 
 def run_in_process(make: MakeFrame[Result], device: Device | None = None) -> Generator[Result]:

@@ -209,22 +209,25 @@ def fit_capture(
     folder.start(resumed=state is not None)
     _run_steps(fit, folder, progress)
     seconds = fit.elapsed
-    if settings.budget is not None and seconds >= settings.budget and fit.steps < settings.iterations * _ENOUGH_STEPS:
-        warnings += (
-            f"the budget of {settings.budget:g} s allowed only {fit.steps} of {settings.iterations} steps; a longer "
-            "fit is sharper",
-        )
     result = FitResult(
         splats=fit.model.splats(),
         iterations=fit.steps,
         seconds=seconds,
         held_out=fit.evaluate(held, folder.held_out),
         inputs=folder.inputs,
-        warnings=warnings,
+        warnings=(*warnings, *_budget_warnings(fit, seconds)),
         validation=fit.evaluate(fit.validation, None),
     )
     folder.save(result, {"units": capture.units, "variant": mi.variant(), "settings": asdict(settings)})
     return result
+
+
+def _budget_warnings(fit: _Fit, seconds: float) -> list[str]:
+    """Return a warning if the budget ended the fit after ``seconds``, early in its schedule."""
+    budget, iterations = fit.settings.budget, fit.settings.iterations
+    if budget is None or seconds < budget or fit.steps >= iterations * _ENOUGH_STEPS:
+        return []
+    return [f"the budget of {budget:g} s allowed only {fit.steps} of {iterations} steps; a longer fit is sharper"]
 
 
 def _run_steps(fit: _Fit, folder: FitFolder, progress: Callable[[FitProgress], None] | None) -> None:

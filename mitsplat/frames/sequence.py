@@ -67,20 +67,7 @@ def render_frames(
         InputError: As in :func:`mitsplat.render_frame`.
     """
     Scene.check(scene)
-    if frames is None:
-        is_film = isinstance(layouts, Iterable) or isinstance(cameras, Iterable)
-        indices: Iterable[int] = itertools.count() if is_film else range(scene.num_frames)
-    elif isinstance(frames, Iterable):
-        indices = frames
-    else:
-        if (count := to_index(frames, "frames")) < 0:
-            raise InputError(f"frames must be 0 or more (got {count})")
-        indices = range(count)
-    if isinstance(frames, Sized) or not isinstance(frames, Iterable | None):
-        wanted = len(indices)  # type: ignore[arg-type]
-        for name, given in (("layouts", layouts), ("cameras", cameras)):
-            if isinstance(given, Sized) and len(given) < wanted:
-                raise InputError(f"{name} must have one item for each of the {wanted} frames (got {len(given)})")
+    indices = _frame_indices(scene, frames, layouts, cameras)
     parts: tuple[object, ...] = (indices, layouts, cameras)
     total = min((len(part) for part in parts if isinstance(part, Sized)), default=None)
     scene = with_unlimited_layouts(scene)
@@ -99,6 +86,29 @@ def render_frames(
             if next_camera is None:  # the scene's next view is not part of the film
                 frame = replace(frame, plan=replace(frame.plan, next_camera=None))
             yield frame
+
+
+def _frame_indices(
+    scene: Scene,
+    frames: int | Iterable[int] | None,
+    layouts: Layout | Iterable[Layout] | None,
+    cameras: Camera | Iterable[Camera] | None,
+) -> Iterable[int]:
+    """Return the indices of the frames; lists of layouts and cameras must suffice for a given number of frames."""
+    if frames is None:
+        is_film = isinstance(layouts, Iterable) or isinstance(cameras, Iterable)
+        return itertools.count() if is_film else range(scene.num_frames)
+    if isinstance(frames, Iterable):
+        indices = frames
+    else:
+        if (count := to_index(frames, "frames")) < 0:
+            raise InputError(f"frames must be 0 or more (got {count})")
+        indices = range(count)
+    if isinstance(indices, Sized):
+        for name, given in (("layouts", layouts), ("cameras", cameras)):
+            if isinstance(given, Sized) and len(given) < len(indices):
+                raise InputError(f"{name} must have one item for each of the {len(indices)} frames (got {len(given)})")
+    return indices
 
 
 def with_unlimited_layouts(scene: Scene) -> Scene:

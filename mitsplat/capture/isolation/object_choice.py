@@ -104,12 +104,7 @@ def choose_object(
     focus, distance = focus_of([view.camera for view in views])
     if box is not None:
         focus = np.array(box, dtype=np.float64).reshape(2, 3).mean(axis=0)
-    counts, central = count_observers([view.seen for view in views], len(points)), np.zeros(len(points))
-    for view in views:
-        camera, shown = view.camera, view.seen
-        pixels, _ = camera.project(points[shown])
-        away = np.linalg.norm(pixels - np.array(camera.size) / 2, axis=1)
-        central[shown] += np.exp(-0.5 * (away / (_IMAGE_SIGMA * max(camera.size))) ** 2)
+    counts = count_observers([view.seen for view in views], len(points))
     near = (counts >= 3) & (np.linalg.norm(points - focus, axis=1) < _MAX_DISTANCE * distance)
     support = find_support(points[near], focus, _MAX_DISTANCE * distance)
     height = points[:, 2] - support.under(points)
@@ -124,24 +119,34 @@ def choose_object(
     gap = gap_between(points[stands], *(bound * distance for bound in _GAP_BOUNDS))
     cluster = np.full(len(points), -1, dtype=np.int64)
     cluster[stands] = cluster_points(points[stands], gap)
+    refused = {_picked_cluster(pick, points, cluster) for pick in picks_not}
     if picks:
-        chosen = np.unique([_picked_cluster(pick, points, cluster) for pick in picks])
+        chosen = {_picked_cluster(pick, points, cluster) for pick in picks}
     else:
         away = np.linalg.norm(points[stands] - focus, axis=1) / (_FOCUS_SIGMA * distance)
-        scores = np.bincount(cluster[stands], central[stands] * np.exp(-0.5 * away**2))
-        for pick in picks_not:
-            scores[_picked_cluster(pick, points, cluster)] = -1
-        chosen = np.array([int(scores.argmax())])
-    refused = {_picked_cluster(pick, points, cluster) for pick in picks_not}
-    if refused >= set(chosen.tolist()):
+        scores = np.bincount(cluster[stands], _centrality(points, views)[stands] * np.exp(-0.5 * away**2))
+        scores[list(refused)] = -1
+        chosen = {int(scores.argmax())}
+    if refused >= chosen:
         raise InputError(
             f"an object is selected by both --pick and --pick-not ({picks_not[0].name}): the picked objects touch"
         )
-    own = np.isin(cluster, [number for number in chosen.tolist() if number not in refused])
+    own = np.isin(cluster, sorted(chosen - refused))
     feet = _project_feet(points[own], height[own], support)
     large = np.flatnonzero(np.bincount(cluster[stands]) >= _MIN_POINTS)
     others = tuple(points[cluster == number] for number in large if not own[cluster == number].any())
     return ChosenObject(np.concatenate([points[own], feet]), points[own], others)
+
+
+def _centrality(points: Float64Array, views: Sequence[PhotoView]) -> Float64Array:
+    """Sum a Gaussian of the distance from the image centre over the photos that observe each point, shape (N,)."""
+    central = np.zeros(len(points))
+    for view in views:
+        camera, shown = view.camera, view.seen
+        pixels, _ = camera.project(points[shown])
+        away = np.linalg.norm(pixels - np.array(camera.size) / 2, axis=1)
+        central[shown] += np.exp(-0.5 * (away / (_IMAGE_SIGMA * max(camera.size))) ** 2)
+    return central
 
 
 def focus_of(cameras: Sequence[Camera]) -> tuple[Float64Array, float]:

@@ -8,6 +8,7 @@ move to the region that explains their photographs best.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +25,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.images.colour import encode_srgb
 from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_light_frame
-from mitsplat.reconstruct.materials.colour_fit import fit_colours, mix_materials
+from mitsplat.reconstruct.materials.colour_fit import ColourFit, fit_colours, mix_materials
 from mitsplat.reconstruct.materials.lit_surfaces import lit_surfaces
 from mitsplat.reconstruct.materials.observations import Observations, View, clear_points, observe, sample_surface
 from mitsplat.reconstruct.materials.surface_light import LitMesh, Reflectance
@@ -178,17 +179,27 @@ def estimate_materials(capture: Capture, mesh: trimesh.Trimesh, light: CaptureLi
     loss = [fit_colours(seen, materials[merged[name]], one).errors for name, one in zip(names, means, strict=True)]
     smooth = np.stack(loss, axis=1)[near].mean(axis=1)
     region = merged[names[smooth.argmin(axis=1)]]
-    colours = np.empty_like(points)
-    for number, (found, fit) in enumerate(zip(regions, fitted_colours, strict=True)):
-        own = region == number
-        # Points that few photos show, and those of metal that mirrors itself, get the colour of their region.
-        prior = np.median(fit.weights, axis=0) * np.where(clear, 0.1, 0.1 + 0.9 * found.metallic)[:, None]
-        colours[own] = ((fit.weights * fit.colours + prior * found.colour) / (fit.weights + prior))[own]
+    colours = _colours_of_regions(region, regions, fitted_colours, clear)
     share = np.bincount(region, minlength=len(regions)) / len(region)
     order = np.argsort(-share, kind="stable")
     regions = [replace(regions[number], share=float(share[number])) for number in order if share[number] > 0]
     explained = 1 - float(smooth.min(axis=1).mean()) / max(_captured_loss(seen, near), 1e-9)
     return MaterialEstimate(tuple(regions), points, colours, np.argsort(order)[region], explained)
+
+
+def _colours_of_regions(
+    region: Int64Array, regions: Sequence[MaterialRegion], fits: Sequence[ColourFit], clear: BoolArray
+) -> Float64Array:
+    """Return the linear base colour of each point, (N, 3), from the fit with the material of its region.
+
+    Points that few photos show, and those of metal that mirrors itself, get the colour of their region.
+    """
+    colours = np.empty((len(region), 3))
+    for number, (found, fit) in enumerate(zip(regions, fits, strict=True)):
+        own = region == number
+        prior = np.median(fit.weights, axis=0) * np.where(clear, 0.1, 0.1 + 0.9 * found.metallic)[:, None]
+        colours[own] = ((fit.weights * fit.colours + prior * found.colour) / (fit.weights + prior))[own]
+    return colours
 
 
 def _clusters(colours: Float64Array, near: Int64Array) -> Int64Array:

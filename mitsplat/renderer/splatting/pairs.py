@@ -118,13 +118,19 @@ def pair_records(
     if not numbered:
         dr.eval(key)
         return Pairs(key)
+    first = _first_pairs(spans, pair_of, count, pairs)
+    dr.eval(key, number, first)
+    return Pairs(key, number, first)
+
+
+def _first_pairs(spans: _Spans, pair_of: mi.UInt32, count: int, pairs: int) -> mi.UInt32:
+    """Return the number of the first pair of each of ``count`` records, and then the number of pairs."""
     first = dr.empty(mi.UInt32, count + 1)
-    end, inside = dr.opaque(mi.UInt32, pairs), spans.first_row < dr.opaque(mi.UInt32, rows)
+    end, inside = dr.opaque(mi.UInt32, pairs), spans.first_row < dr.opaque(mi.UInt32, dr.width(spans.owner))
     first_pair = dr.gather(mi.UInt32, pair_of, spans.first_row, inside)
     dr.scatter(first, dr.select(inside, first_pair, end), dr.arange(mi.UInt32, count))
     dr.scatter(first, end, dr.opaque(mi.UInt32, count))
-    dr.eval(key, number, first)
-    return Pairs(key, number, first)
+    return first
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,16 +120,7 @@ def plan_frame(
     index = to_index(index, "frame")
     spec, number = scene.spec, layout_index_of(scene, index)
     if lights is not None:
-        if not isinstance(lights, Sequence) or isinstance(lights, str):
-            raise InputError(f"lights must be a list of lights (got a {type(lights).__name__}): put one light in [ ]")
-        spec = SceneSpec(**{**dict(spec), "lights": tuple(lights)})  # validates the lights
-        if unknown := {name for _, name in light_images(spec)} - set(scene.images):
-            raise InputError(f"images of lights must be images that the scene file names (got {min(unknown)!r})")
-        for light in spec.lights:
-            if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
-                raise InputError(
-                    f"pools of lights must be lists of images that the scene file names (got {light.pool!r})"
-                )
+        spec = _with_lights(scene, lights)
     view = index - number * spec.output.views
     time = view / max(1, spec.output.views - 1)
     ranges = spec.randomise
@@ -157,6 +148,19 @@ def plan_frame(
         viewpoint=viewpoint.drawn,
         belt=belt_of(spec, view),
     )
+
+
+def _with_lights(scene: Scene, lights: Sequence[LightEntry]) -> SceneSpec:
+    """Return the specification of a scene with other lights, which may use only images of the scene file."""
+    if not isinstance(lights, Sequence) or isinstance(lights, str):
+        raise InputError(f"lights must be a list of lights (got a {type(lights).__name__}): put one light in [ ]")
+    spec = SceneSpec(**{**dict(scene.spec), "lights": tuple(lights)})  # validates the lights
+    if unknown := {name for _, name in light_images(spec)} - set(scene.images):
+        raise InputError(f"images of lights must be images that the scene file names (got {min(unknown)!r})")
+    for light in spec.lights:
+        if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
+            raise InputError(f"pools of lights must be lists of images that the scene file names (got {light.pool!r})")
+    return spec
 
 
 def _range_of(ranges: Randomise, name: str) -> tuple[float, float] | None:

@@ -28,7 +28,7 @@ from mitsplat.mesh_files.mesh_file import (
     world_from_file,
 )
 from mitsplat.mesh_files.mesh_reading import read_mesh_file
-from mitsplat.mesh_files.trimesh_files import scene_parts
+from mitsplat.mesh_files.trimesh_parts import scene_parts
 
 _MAX_POSITION = 1e10
 """Largest coordinate [units of the file] at which vertices can be merged by their positions."""

@@ -30,7 +30,7 @@ from mitsplat.cli.options import (
 from mitsplat.errors import InputError
 
 if TYPE_CHECKING:
-    from mitsplat.importing.splat_import import Imported
+    from mitsplat.importing.import_result import Imported
     from mitsplat.mesh_files.mesh_file import MeshFile
 
 Overwrite = Annotated[

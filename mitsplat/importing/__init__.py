@@ -6,6 +6,7 @@ loose splats, with a closed mesh and convex pieces, and an HTML page for visual 
 
 from __future__ import annotations
 
-from mitsplat.importing.splat_import import Imported, ImportSettings, import_splats
+from mitsplat.importing.import_result import Imported
+from mitsplat.importing.splat_import import ImportSettings, import_splats
 
 __all__ = ["ImportSettings", "Imported", "import_splats"]

@@ -14,7 +14,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import mass_properties
-from mitsplat.importing.splat_import import Imported
+from mitsplat.importing.import_result import Imported
 from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report_page
 from mitsplat.reconstruct.asset_evaluation import show_asset
 from mitsplat.storage.files import is_inside, write_text

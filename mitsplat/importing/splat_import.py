@@ -7,7 +7,7 @@ up axis is estimated; the user must give the unit or the size.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -17,7 +17,7 @@ import shapely
 import trimesh
 
 from mitsplat.arguments import check_fields, check_number, check_text, check_type, path_of
-from mitsplat.arrays import BoolArray, Float64Array
+from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
@@ -27,23 +27,19 @@ from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.gltf_splats.splat_reading import is_gltf, read_gltf_splats
+from mitsplat.importing.cleaning import OUTLIERS, Cleaner
+from mitsplat.importing.import_result import Imported, ImportSupport
+from mitsplat.importing.standing import cut_base, topples
 from mitsplat.importing.upright import Plane, Upright, cut_support, find_up
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.asset_evaluation import AssetView, Thresholds, iou, is_closed, show_asset
+from mitsplat.reconstruct.asset_evaluation import iou, is_closed, show_asset
 from mitsplat.reconstruct.registration import measure_offset, surface_points
-from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 from mitsplat.renderer.layers import render_splats
 from mitsplat.runtime.variant import one_at_a_time
 from mitsplat.usd.stage_assets import StageAsset, read_stage_asset
 from mitsplat.usd.usd_layers import is_usd
 
-MIN_OPACITY = 1 / 255
-"""Opacity below which a Gaussian is invisible in every picture."""
-MAX_SCALE = 0.2
-"""Standard deviation above which a Gaussian of an object counts as haze, as a fraction of the longest extent."""
-_OUTLIERS = 0.005
-"""Fraction of the Gaussians at either end of an axis that is ignored for the size of an object."""
 _FOV, _DISTANCE = 29.0, 4.5
 """Field of view [degrees] of the views of an object, and their distance in radii of the object."""
 _TEST_VIEWS = 6
@@ -51,12 +47,6 @@ _CONCAVITY = 0.04
 """Concavity threshold of convex pieces; the surface of splats is too rough for a smaller one."""
 _SMALL_PART = 0.1
 """Volume of a part, relative to the largest part, below which its convex hull is one piece: leaves, lids, screws."""
-_MAX_TILT = 4.0
-"""Tilt that an object must withstand without falling over [degrees]."""
-_CONTACT_HEIGHT = 0.01
-"""Maximum height of vertices that touch the table, as a fraction of the longest extent."""
-_MAX_BASE_CUT = 0.06
-"""Maximum height that is cut off an object for a flat base, as a fraction of its height."""
 FROM_GLTF_AXES: Mapping[Axis, Axis] = {"y": "z", "-y": "-z", "z": "-y", "-z": "y", "x": "x", "-x": "-x"}
 """Axis of splats with z up for each axis of their glTF file, in which y points up."""
 _STAGES = 6
@@ -103,97 +93,6 @@ class ImportSettings:
             low < high for low, high in zip(self.crop[:3], self.crop[3:], strict=True)
         ):
             raise InputError(f"crop must be a lower and an upper corner (got {' '.join(f'{v:g}' for v in self.crop)})")
-
-
-@dataclass(frozen=True, eq=False)
-class ImportSupport:
-    """Horizontal surface of an environment for dropping objects; its centre is the origin.
-
-    Attributes:
-        size: Size along x and y [m].
-        share: Fraction of the visible area that lies in the surface.
-    """
-
-    size: tuple[float, float]
-    share: float
-
-
-@dataclass(frozen=True, eq=False)
-class Imported:
-    """Imported asset and the results of the import.
-
-    Attributes:
-        asset: Asset in metres, or in the file's units where these are unknown; z up. An object stands on z = 0 with the
-            centre of its base at the origin. For an environment, the origin is the centre of its largest horizontal
-            surface.
-        upright: Estimated up direction, in the file's axes, and its reason.
-        found: Number of Gaussians in the file.
-        removed: Number of removed Gaussians, by reason.
-        removed_splats: Removed Gaussians, in the asset's frame.
-        support: Surface of an environment for dropping objects, or None.
-        watertight: True if the mesh encloses a volume.
-        topples: True if the object would fall over in its pose.
-        views: Pictures of asset and mesh from views that were not used for the reconstruction.
-        mesh_iou: Mean IoU of the silhouettes of mesh and splats in these views, for an object.
-        offset: Shift between the mesh and the surface of the splats, as a fraction of the mesh's diagonal.
-    """
-
-    asset: Asset
-    upright: Upright
-    found: int
-    removed: dict[str, int]
-    removed_splats: Splats
-    support: ImportSupport | None
-    watertight: bool
-    topples: bool
-    views: Sequence[AssetView] = ()
-    mesh_iou: float | None = None
-    offset: float | None = None
-
-    @property
-    def removed_of_all(self) -> str:
-        """Summary of the remaining and the removed Gaussians, as text."""
-        removed = ", ".join(f"{count} {reason}" for reason, count in self.removed.items() if count) or "none"
-        return f"{len(self.asset.splats)} of {self.found}; removed: {removed}"
-
-    @property
-    def training(self) -> str | None:
-        """Training that the file states, with the kernel that renders it, as text; None if it states none."""
-        kernel = self.asset.splats.kernel
-        if kernel == "mip":
-            return (
-                "with antialiasing; scenes render it with `rendering: {kernel: mip}` unless they state another kernel"
-            )
-        if kernel in ("3dgs", "gsplat"):
-            return f"without antialiasing; `rendering: {{kernel: {kernel}}}` in a scene renders it as it was trained"
-        return None
-
-    @property
-    def misses(self) -> tuple[str, ...]:
-        """Problems of the asset with their remedies, a sentence each."""
-        asset, found, thresholds = self.asset, [], Thresholds()
-        if asset.units == "unknown":
-            found.append("its size is unknown: give --size, the longest extent in metres, or --units")
-        if self.topples:
-            found.append(
-                "it would roll or fall over in the pose of the pictures: give --up if it lies on its side, or "
-                "--flat-base if the capture lacks its underside"
-            )
-        if self.mesh_iou is not None and self.mesh_iou < thresholds.mesh_iou:
-            found.append(
-                f"the silhouettes of mesh and splats have an IoU of only {self.mesh_iou:.3f} (at least "
-                f"{thresholds.mesh_iou:g} is expected): crop haze around the object, or give more --voxels"
-            )
-        if self.offset is not None and self.offset > thresholds.offset:
-            found.append(
-                f"mesh and splats are {self.offset:.2%} of the diagonal apart (at most {thresholds.offset:.2%} is "
-                "expected): if the file contains more than the object, crop it"
-            )
-        if asset.kind == "object" and not self.watertight:
-            found.append("the mesh is open (it must be closed): give more --voxels, or crop the surroundings")
-        if asset.kind == "environment" and self.support is None:
-            found.append("no horizontal surface was found: state shapes and the region of a scene by hand")
-        return tuple(found)
 
 
 @one_at_a_time
@@ -275,7 +174,7 @@ def import_splats(
         removed_splats=cleaner.removed_splats().transformed(asset_from_file),
         support=support,
         watertight=asset.mesh is not None and is_closed(asset.mesh),
-        topples=kind == "object" and asset.mesh is not None and _topples(asset.mesh),
+        topples=kind == "object" and asset.mesh is not None and topples(asset.mesh),
     )
     if asset.mesh is None:
         return result
@@ -288,13 +187,13 @@ def import_splats(
 
 
 def _upright_surface(
-    path: Path, cleaner: _Cleaner, turn: Float64Array, kind: str, settings: ImportSettings, *, lowest: float
+    path: Path, cleaner: Cleaner, turn: Float64Array, kind: str, settings: ImportSettings, *, lowest: float
 ) -> tuple[Splats, trimesh.Trimesh | None]:
     """Return the upright splats and their surface, with a flat base if it is wanted or if the object would topple."""
     splats = cleaner.splats.transformed(turn)
     mesh = _surface(splats, kind, settings, lowest)
-    if mesh is not None and (settings.flat_base or (settings.without_table and _topples(mesh))):
-        mesh, height = _cut_base(path, mesh)
+    if mesh is not None and (settings.flat_base or (settings.without_table and topples(mesh))):
+        mesh, height = cut_base(path, mesh)
         cleaner.remove("below the base", splats.means[:, 2] < height, "nothing is above its base")
         splats = cleaner.splats.transformed(turn)
     return splats, mesh
@@ -314,9 +213,9 @@ def _compare_mesh(result: Imported, mesh: trimesh.Trimesh, settings: ImportSetti
 
 def _clean(
     path: Path, loaded: Splats, kind: str, settings: ImportSettings, report: Callable[[str], None]
-) -> tuple[_Cleaner, Upright]:
+) -> tuple[Cleaner, Upright]:
     """Remove floaters, and what lies outside of the box or belongs to the table; return the rest and its up axis."""
-    cleaner = _Cleaner(path, loaded)
+    cleaner = Cleaner(path, loaded)
     if settings.crop is not None:
         cleaner.crop(settings.crop)
     report("removing floaters")
@@ -389,55 +288,6 @@ def _in_metres(
     return asset, asset_from_file, factor
 
 
-class _Cleaner:
-    """Remaining Gaussians of a file, and the reasons for the removal of the others."""
-
-    def __init__(self, path: Path, splats: Splats) -> None:
-        self._path, self._all, self._remaining = path, splats, np.ones(len(splats), dtype=bool)
-        self.removed: dict[str, int] = {}
-
-    def crop(self, box: Sequence[float]) -> None:
-        """Remove what lies outside of a box: lower corner, upper corner."""
-        low, high = np.reshape(box, (2, 3))
-        outside = np.asarray(((self._all.means < low) | (self._all.means > high)).any(axis=1))
-        span = ", ".join(f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", *self._all.bounds, strict=True))
-        self.remove("outside of the box", outside, f"crop keeps nothing: the file has {span}")
-
-    @property
-    def splats(self) -> Splats:
-        """Remaining Gaussians."""
-        return self._all.select(self._remaining)
-
-    def removed_splats(self) -> Splats:
-        """Return the removed Gaussians."""
-        return self._all.select(~self._remaining)
-
-    def remove(self, reason: str, which: BoolArray, otherwise: str) -> None:
-        """Remove some of the remaining Gaussians, and raise an error if none would remain."""
-        self.removed[reason] = self.removed.get(reason, 0) + int(which.sum())
-        self._remaining[np.flatnonzero(self._remaining)[which]] = False
-        if not self._remaining.any():
-            raise InputError(f"{self._path}: {otherwise}")
-
-    def remove_floaters(self, kind: str) -> None:
-        """Remove Gaussians that are invisible, too large to be part of an object, or connected to no large part."""
-        self.remove("invisible", self.splats.opacities < MIN_OPACITY, "all Gaussians are invisible")
-        if kind == "object":
-            splats = self.splats
-            size = _extent(splats)
-            haze = (splats.scales.max(axis=1) > MAX_SCALE * size) | long_needles(splats, size)
-            self.remove("haze and needles", haze, "all Gaussians are haze or needles: is it an environment?")
-        splats = self.splats
-        floating = np.zeros(len(splats), dtype=bool)
-        floating[find_floaters(splats, visible_area(splats))] = True
-        self.remove("floaters", floating, "the Gaussians do not touch each other")
-
-
-def _extent(splats: Splats) -> float:
-    """Return the longest extent of the Gaussians without outliers."""
-    return float(np.ptp(np.quantile(splats.means, (_OUTLIERS, 1 - _OUTLIERS), axis=0), axis=0).max())
-
-
 def _cameras(
     splats: Splats, kind: str, settings: ImportSettings, count: int, *, lowest: float, turn: float = 0.0
 ) -> list[Camera]:
@@ -445,7 +295,7 @@ def _cameras(
 
     Views of an environment look at the origin, from within its extent.
     """
-    low, high = np.quantile(splats.means.astype(np.float64), (_OUTLIERS, 1 - _OUTLIERS), axis=0)
+    low, high = np.quantile(splats.means.astype(np.float64), (OUTLIERS, 1 - OUTLIERS), axis=0)
     if kind == "object":
         middle, radius, fov = (low + high) / 2, 0.5 * float(np.linalg.norm(high - low)), _FOV
         away = _DISTANCE * radius
@@ -505,25 +355,3 @@ def _align_to_support(splats: Splats, plane: Plane) -> tuple[ImportSupport | Non
         -np.append(corners.mean(axis=0), plane.height)
     )
     return ImportSupport((float(np.linalg.norm(along)), float(np.linalg.norm(across))), plane.share), motion
-
-
-def _cut_base(path: Path, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float]:
-    """Cut off the lowest part of a solid, as little as possible, so that it stands; return the height too."""
-    (low, *_), high = mesh.bounds[:, 2], mesh.bounds[1] + mesh.scale
-    for height in low + _MAX_BASE_CUT * np.linspace(0, 1, 11)[1:] * float(mesh.extents[2]):
-        corner = np.append(mesh.bounds[0, :2] - mesh.scale, height)
-        above = trimesh.creation.box(bounds=[corner, high])
-        cut = trimesh.boolean.intersection([mesh, above], engine="manifold")
-        if len(cut.faces) and not _topples(cut, contact=0.2 * _CONTACT_HEIGHT):
-            return cut, float(height)
-    raise InputError(f"{path}: has no base to stand on: give --up, or leave out --flat-base")
-
-
-def _topples(mesh: trimesh.Trimesh, contact: float = _CONTACT_HEIGHT) -> bool:
-    """Return True if an object in its pose falls over or rolls away when it is tilted by :data:`_MAX_TILT`."""
-    low = float(mesh.bounds[0, 2])
-    middle = mesh.center_mass if mesh.is_watertight else mesh.centroid
-    touching = mesh.vertices[mesh.vertices[:, 2] <= low + contact * float(mesh.extents.max()), :2]
-    ground = shapely.MultiPoint(touching).convex_hull
-    reach = np.tan(np.radians(_MAX_TILT)) * (float(middle[2]) - low)
-    return not ground.contains(shapely.Point(middle[:2]).buffer(reach))

@@ -20,7 +20,7 @@ from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.images.colour import decode_srgb
-from mitsplat.mesh_files.trimesh_files import read_material
+from mitsplat.mesh_files.trimesh_parts import read_material
 
 COLOUR = (200, 120, 40)
 QUICK = BakeSettings(gaussians=300, fit_steps=0, verify_views=1)

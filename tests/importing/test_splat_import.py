@@ -19,7 +19,9 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_files import default_up_axis
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.importing.import_report import write_import_report, write_scene
-from mitsplat.importing.splat_import import Imported, ImportSettings, _cut_base, _topples, import_splats
+from mitsplat.importing.import_result import Imported
+from mitsplat.importing.splat_import import ImportSettings, import_splats
+from mitsplat.importing.standing import cut_base, topples
 from mitsplat.importing.upright import axis_vector, cut_support, find_up, rotation_to_z
 from mitsplat.quality import KernelName
 from mitsplat.reconstruct.surface import SurfaceSettings
@@ -178,14 +180,14 @@ def test_parts_below_the_base_are_removed(pin: trimesh.Trimesh) -> None:
     bulge = trimesh.creation.icosphere(3, 0.03)
     bulge.apply_translation((0.02, 0, 0.015))
     swollen = trimesh.boolean.union([pin, bulge], engine="manifold")
-    assert _topples(swollen)
-    assert not _topples(pin)
-    cut, height = _cut_base(Path("pin.ply"), swollen)
+    assert topples(swollen)
+    assert not topples(pin)
+    cut, height = cut_base(Path("pin.ply"), swollen)
     assert cut.is_volume
     assert -0.01 < height <= cut.bounds[0, 2] + 1e-9 < 0.01
-    assert not _topples(cut)
+    assert not topples(cut)
     with pytest.raises(InputError, match="no base to stand on"):
-        _cut_base(Path("ball.ply"), trimesh.creation.cone(0.05, 0.5, transform=np.diag([1, -1, -1, 1])))
+        cut_base(Path("ball.ply"), trimesh.creation.cone(0.05, 0.5, transform=np.diag([1, -1, -1, 1])))
 
 
 def test_imported_surroundings_get_a_support(tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
 """Captures: photographs with their cameras, and the points of structure from motion.
 
-A capture folder has ``capture.json`` (keys: :class:`CaptureSpec`), ``points.npz``, ``images/`` and ``masks/``. Cameras
-and points are in the frame of the asset that is made from the capture. Conventions are those of
-:mod:`mitsplat.gaussians.splat_cloud`.
+A capture folder has ``capture.json`` (keys: :class:`~mitsplat.capture.capture_spec.CaptureSpec`), ``points.npz``,
+``images/`` and ``masks/``. Cameras and points are in the frame of the asset that is made from the capture. Conventions
+are those of :mod:`mitsplat.gaussians.splat_cloud`.
 """
 
 from __future__ import annotations
@@ -15,23 +15,21 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
-from pydantic import BaseModel, ConfigDict, Field
 
 from mitsplat.arguments import checks_arguments
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
+from mitsplat.capture.capture_spec import CaptureSpec, PhotoCamera, PhotoSpec
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.lens import Lens
 from mitsplat.geometry.rigid import split_similarity
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.storage.content_hash import ContentHash
-from mitsplat.storage.field_types import Positive
 from mitsplat.storage.file_kinds import no_folder_with
 from mitsplat.storage.files import IMAGE_ERRORS, copy_file, resolve_inside, write_file, write_text
 from mitsplat.storage.format_version import FORMAT_VERSIONS
@@ -42,48 +40,6 @@ HELD_OUT_EVERY = 8
 
 CAPTURE_FILE = "capture.json"
 _POINTS = "points.npz"
-_Row = tuple[float, float, float, float]
-
-
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PhotoCamera(_Strict):
-    """Keys of a camera, as in :class:`~mitsplat.geometry.camera.Camera`."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
-    near: float
-    lens: Lens = "opencv"
-    world_from_camera: tuple[_Row, _Row, _Row, _Row]
-
-
-class PhotoSpec(_Strict):
-    """Keys of a photo; file names are relative to the capture folder, and ``gain`` is absent without a correction."""
-
-    name: str = Field(min_length=1)
-    file: str = Field(min_length=1)
-    mask: str | None = None
-    camera: PhotoCamera
-    gain: tuple[Positive, Positive, Positive] | None = Field(None, exclude_if=lambda gain: gain is None)
-
-
-class CaptureSpec(_Strict):
-    """Keys of ``capture.json``."""
-
-    format_version: int = Field(1, ge=1)
-    units: Literal["metre", "unknown"]
-    up: Literal["z", "unknown"]
-    table: bool = False
-    scale_error: Annotated[float, Field(ge=0)] | None = None
-    rejected: dict[str, str]
-    photos: list[PhotoSpec]
 
 
 Window = tuple[int, int, int, int]

@@ -36,7 +36,7 @@ from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightSpec
 from mitsplat.storage.files import JsonObject, library_errors, storage_errors, write_file
 from mitsplat.usd.frame_content import FrameContent, frame_content
-from mitsplat.usd.stage_records import METADATA
+from mitsplat.usd.stage_reader import METADATA
 from mitsplat.usd.usd_layers import is_usd, require_usd
 
 if TYPE_CHECKING:

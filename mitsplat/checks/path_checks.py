@@ -17,6 +17,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.asset import ASSET_FILE, Asset, opaque_core
 from mitsplat.checks.exposure_check import check_exposure
 from mitsplat.checks.lamp_check import check_lamps
+from mitsplat.checks.room_check import check_room
 from mitsplat.checks.scene_warnings import scene_warnings
 from mitsplat.dataset.preflight import run_faults
 from mitsplat.errors import InputError
@@ -46,8 +47,6 @@ MIN_OVERLAP = 0.5
 MAX_OFFSET = 0.02
 MAX_SPREAD = 0.05
 """Maximum median distance between splats and mesh, as a fraction of the mesh's diagonal."""
-MAX_FILL = 0.35
-"""Maximum fraction of the region's volume for dropped objects; loose packing of boxes ends at about 0.6."""
 MIN_SPREAD_DIFFERENCE = 0.5
 """Relative difference of spreads above which an environment that is thinner along x or y seems to lie on its side."""
 
@@ -234,19 +233,11 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
             yield replace(finding, name=f"{name}: {finding.name}")
         if not wrong:
             yield Finding(name, True, f"{len(sizes[0].splats)} Gaussians, no problems")
-    most = [entry.count[1] for entry in spec.objects]
-    meshes = [[asset.mesh for i in pool if (asset := scene.assets[i]).mesh is not None] for pool in scene.pools]
-    volumes = [max(float(np.prod(mesh.extents)) for mesh in pool) for pool in meshes]
-    space = sum(float(np.prod(np.subtract(region.max, region.min))) for region, _ in spec.all_regions)
-    fill = float(np.dot(most, volumes)) / space
-    yield Finding(
-        "room", fill <= MAX_FILL or not spec.objects, f"at most {sum(most)} objects take {fill:.0%} of the region",
-        "make the region larger, lower objects[].count, or use settle.arrangement: pile",
-    )  # fmt: skip
     support = any(shape.collider and not shape.name.startswith("enclosure ") for shape in spec.shapes)
     support |= spec.environment_collides and bool(scene.environments)
     text = "a collider supports objects" if support else "there is no collider below objects"
     yield Finding("support", support or not spec.objects, text, "add a table to shapes, or set environment_collides")
+    yield check_room(scene, draw=support and not faults)
     if support and not faults:
         yield from _check_rest(scene)
     yield _check_view(scene)

@@ -269,7 +269,7 @@ class IncompleteLayouts:
             raise InputError(
                 f"{self._scene.path}: at most a fraction settle.incomplete = {share:g} of the {self._layouts} layouts "
                 f"may lack objects that do not come to rest (got {len(self._incomplete)}, among them {often}); "
-                "`mitsplat check` tries each object alone"
+                "`mitsplat check` names regions without room, and tries each object alone"
             )
 
 

@@ -210,7 +210,7 @@ class Drop:
 
     def _try(self, index: int, drawn: Sequence[_DrawnObject], refused: Sequence[str]) -> Layout | _Rejection:
         """Drop the given objects from the next draw of start poses."""
-        number = self._static_key(index)
+        number = self.static_key(index)
         assets, static = tuple(one.asset for one in drawn), self.static_scenes[number]
         items, arrangements = self._items(drawn), self._arrangements(drawn)
         rng = random_stream(self.scene.spec.seed, "object poses", index, len(refused))
@@ -288,7 +288,7 @@ class Drop:
         attempt = certificate.attempts - 1
         rng = random_stream(self.scene.spec.seed, "object poses", layout.index, attempt)
         capacity = 2.0 ** certificate.refused.count(CONTACT_OVERFLOW)
-        number = self._static_key(layout.index)
+        number = self.static_key(layout.index)
         world = self.world_of(assets, capacity, number)
         start = self.start_poses.draw(self._items(drawn), self.static_scenes[number], rng, self._arrangements(drawn))
         restarted = np.zeros(len(drawn), dtype=bool)
@@ -303,7 +303,7 @@ class Drop:
         self._run(world, start, layout.index, attempt, drawn, rng, observe)
         yield from moments
 
-    def _static_key(self, layout: int) -> int:
+    def static_key(self, layout: int) -> int:
         """Return the key of a layout's static scene; environments without collision share one.
 
         If colliders are drawn per layout, each layout has its own static scene, and the last one is cached.
@@ -330,7 +330,7 @@ class Drop:
         """Simulate a draw of a layout from its start poses (N, 4, 4); ``rng`` draws those of objects that fail."""
         settle = self.scene.spec.settle
         fastest = _POUR_SPEED if any(one.arrangement == "pile" for one in drawn) else np.inf
-        static, arrangements = self.static_scenes[self._static_key(index)], self._arrangements(drawn)
+        static, arrangements = self.static_scenes[self.static_key(index)], self._arrangements(drawn)
         free = np.array([one.given is None for one in drawn])
         own = np.array([one.region for one in drawn])
 

@@ -1,6 +1,7 @@
 """Preflight checks: a valid asset and scene pass; each inserted fault is found and comes with a remedy."""
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +12,10 @@ from ruamel.yaml import YAML
 from mitsplat.asset import Asset
 from mitsplat.checks.path_checks import _SCENE_KEYS, SIZE_LIMITS, _located, _mass, check_asset, check_scene
 from mitsplat.checks.scene_warnings import scene_warnings
+from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.physics.settle import settle_layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.cli.typed import run
 from tests.conftest import box_asset
@@ -136,6 +139,49 @@ def test_an_asset_of_several_sizes_is_listed_once(scene_data, write_scene, monke
         ("nut: units", "the longest extent is 0.015 m"),
         ("bolt", "12 Gaussians, no problems"),
     ]
+
+
+NARROW = {"min": [-0.2, -0.02, 0.02], "max": [0.2, 0.02, 0.3]}
+
+
+@pytest.mark.parametrize(
+    ("change", "crowded"),
+    [
+        # A row of 0.4 m has no room for 20 nuts of at least 20 mm at distances of at least 2 mm.
+        ({"region": NARROW, "settle": {"arrangement": "packed"}}, "20 objects in main, packed"),
+        ({"region": NARROW, "settle": {"arrangement": "pile"}}, ""),
+        (
+            {
+                "regions": [{"name": "shelf", **NARROW, "arrangement": "packed"}],
+                "objects": [{"asset": "assets/nut", "count": 20, "region": "shelf"}, {"asset": "assets/bolt"}],
+            },
+            "20 objects in shelf, packed",
+        ),
+        (  # a post, whose place is drawn for each layout, stands in the row
+            {
+                "region": NARROW,
+                "settle": {"arrangement": "packed"},
+                "objects": [{"asset": "assets/nut", "count": 10}],
+                "shapes": [
+                    {"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}},
+                    {"name": "post", "box": {"size": [0.04, 0.04, 0.8]}, "jitter": 0.001},
+                ],
+            },
+            "10 objects in main, packed",
+        ),
+    ],
+)
+def test_a_region_that_is_too_small_for_an_arrangement_is_named(scene_data, write_scene, change, crowded):
+    """Objects that stand side by side need floor area, which the volume of the region does not show."""
+    scene_data |= {"objects": [{"asset": "assets/nut", "count": 20}], **change}
+    scene = load_scene(write_scene(scene_data))
+    (room,) = (finding for finding in check_scene(scene) if finding.name == "room")
+    assert room.ok == (not crowded)
+    if crowded:
+        assert room.text == f"layout 0 has no room for all objects at the start: {crowded}"
+        with suppress(InputError):  # more than half of them have no room
+            reasons = {one.reason for one in settle_layout(scene, 0, cached=False).left_out}
+            assert reasons == {"no room for all in 1 of 1 draws"}
 
 
 def test_an_object_that_cannot_fit_is_refused(scene_data, write_scene, capsys):

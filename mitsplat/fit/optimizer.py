@@ -209,7 +209,7 @@ class GaussianModel(Adam):
             depth: True to render depths as well.
 
         Returns:
-            The rendering; a :class:`DepthRendering` if ``depth`` is True.
+            The rendering; a :class:`~mitsplat.renderer.differentiation.backward.DepthRendering` if ``depth`` is True.
         """
         found = _project(dr.detach(self.values), self._unit, eye.view.kind, eye.numbers, quality, self.bands)
         return render_records(*found, eye.view, quality, depth=depth)

@@ -27,7 +27,7 @@ class ListsFile:
     Every list except the first grows in a separate file, which is appended at the end.
 
     Args:
-        path: The file, which gets its final name in :meth:`keep`.
+        path: The file, which gets its final name in :meth:`commit`.
         lists: Names of the lists, in their order.
         before: Entries before the lists.
         after: Entries after the lists.
@@ -70,7 +70,7 @@ class ListsFile:
         first.commit()
 
     def discard(self) -> None:
-        """Remove the temporary files, unless the file was kept."""
+        """Remove the temporary files, unless the file was committed."""
         for part in self._parts.values():
             part.discard()
 

@@ -37,7 +37,7 @@ def read_coco(root: Path, split: Split, progress: Progress | None) -> LabelledSe
     """Read a COCO folder.
 
     Raises:
-        InputError: As :func:`read_set`.
+        InputError: As :func:`~mitsplat.detector.labelled_sets.set_reading.read_set`.
     """
     parts = [_coco_part(root, split, *file, progress) for file in _coco_files(root, split).items()]
     parts = [reorder_classes(part, parts[0].class_names, str(root)) for part in parts]

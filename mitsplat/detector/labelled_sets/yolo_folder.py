@@ -36,7 +36,7 @@ def read_yolo(root: Path, split: Split, progress: Progress | None) -> LabelledSe
     """Read a folder with ``data.yaml``, or with ``classes.txt`` beside the folders ``images`` and ``labels``.
 
     Raises:
-        InputError: As :func:`read_set`.
+        InputError: As :func:`~mitsplat.detector.labelled_sets.set_reading.read_set`.
     """
     path = root / "data.yaml"
     if not path.is_file():
@@ -58,7 +58,7 @@ def read_mitsplat(root: Path, split: Split, progress: Progress | None) -> Labell
     """Read a mitsplat dataset from its YOLO files.
 
     Raises:
-        InputError: As :func:`read_set`.
+        InputError: As :func:`~mitsplat.detector.labelled_sets.set_reading.read_set`.
     """
     if not (root / "labels").is_dir():
         raise InputError(f"{root}: training needs YOLO labels: add yolo to output.formats of the scene")

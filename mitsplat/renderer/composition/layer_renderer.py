@@ -313,7 +313,7 @@ class LayerRenderer:
     def _shape_votes(self, contents: SceneContents, view: CameraView, z_max: mi.Float | None) -> mi.UInt32 | None:
         """Return the shape of an instance that each pixel shows, or None if all its shapes are lit alike.
 
-        Shapes are rows of :class:`Traits`.
+        Shapes are rows of :class:`~mitsplat.renderer.light.light_traits.Traits`.
         """
         if contents.traits.placements is None or contents.clouds is None:
             return None

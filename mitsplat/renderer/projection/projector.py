@@ -42,7 +42,7 @@ class _Input:
     Attributes:
         gaussian: Geometry.
         opacity, instance: Opacity, and instance id of the placement.
-        appearance: Columns of :class:`AppearanceRow` of the placement.
+        appearance: Columns of :class:`~mitsplat.renderer.projection.records.AppearanceRow` of the placement.
         point: Centre in the cloud's frame.
     """
 

@@ -125,7 +125,7 @@ def trace(
     Args:
         clouds: Gaussians on the device.
         placements: Poses of the clouds.
-        view: The camera, from :meth:`View.sampled`.
+        view: The camera, from :meth:`CameraView.sampled`.
         quality: Order, cut-offs and kernel.
         z_max: Depth along z [m] of the nearest visible surface per pixel; Gaussians behind it are not visible.
 

@@ -79,7 +79,7 @@ def bin_gaussians(
     groups: mi.UInt32 | None = None,
     for_gradients: bool = False,
 ) -> TileLists:
-    """Build the tile lists of all placements for a view from :meth:`View.sampled`.
+    """Build the tile lists of all placements for a view from :meth:`CameraView.sampled`.
 
     Args:
         clouds: Gaussians on the device.

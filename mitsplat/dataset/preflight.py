@@ -281,8 +281,8 @@ def reachable_box(scene: Scene) -> tuple[Float64Array, Float64Array]:
     names = [name for name, _ in colliders]
     lows, highs = [], []
     for number, (place, arrangements) in enumerate(scene.spec.all_regions):
-        low, high = enclosed_bounds(place, boxes, walls_beside(scene.spec, number, names, walls))
-        high[2] += PILE_HEIGHT if "pile" in arrangements else 0.0
+        beside = walls_beside(scene.spec, number, names, walls)
+        low, high = enclosed_bounds(place, arrangements, boxes, beside)
         lows.append(low)
         highs.append(high)
     low, high = np.min(lows, axis=0), np.max(highs, axis=0)

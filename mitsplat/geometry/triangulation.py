@@ -29,18 +29,27 @@ def triangulate(observations: Sequence[tuple[Camera, Float64Array]]) -> Float64A
         start = nearest_point_to_lines(centres, rays / np.linalg.norm(rays, axis=1, keepdims=True))
         poses = np.array([camera.camera_from_world for camera in cameras])
         focal = np.array([(camera.fx, camera.fy) for camera in cameras])
-
-        def residuals(point: Float64Array, poses: Float64Array = poses, focal: Float64Array = focal) -> Float64Array:
-            local = poses[:, :3, :3] @ point + poses[:, :3, 3]
-            depth = np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:])
-            return np.asarray(((local[:, :2] / depth - local_rays[:, :2]) * focal).ravel())  # noqa: B023 - used at once
-
-        point = least_squares(residuals, start, loss="soft_l1").x
-        errors = np.linalg.norm(residuals(point).reshape(-1, 2), axis=1)
+        found = poses, focal, local_rays[:, :2]
+        point = least_squares(_residuals, start, loss="soft_l1", args=found).x
+        errors = np.linalg.norm(_residuals(point, *found).reshape(-1, 2), axis=1)
         if errors.max() <= MAX_ERROR:
             return np.asarray(point)
         del observations[int(errors.argmax())]
     return None
+
+
+def _residuals(point: Float64Array, poses: Float64Array, focal: Float64Array, slopes: Float64Array) -> Float64Array:
+    """Compute the reprojection errors of a point [px], without lens distortion, shape (2 N,).
+
+    Args:
+        point: The point, shape (3,).
+        poses: Camera-from-world transforms, shape (N, 4, 4).
+        focal: Focal lengths [px], shape (N, 2).
+        slopes: Slopes of the observed rays, shape (N, 2).
+    """
+    local = poses[:, :3, :3] @ point + poses[:, :3, 3]
+    depth = np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:])
+    return np.asarray(((local[:, :2] / depth - slopes) * focal).ravel())
 
 
 def count_observers(seen: Iterable[Int32Array], count: int) -> Int64Array:

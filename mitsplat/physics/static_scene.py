@@ -17,7 +17,7 @@ from mitsplat.physics.contacts import ContactFinder
 from mitsplat.progress import Note
 from mitsplat.scene.planning.shape_poses import placed_shapes
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.walls import PILE_HEIGHT, enclosed_bounds, enclosure_box, walls_beside
+from mitsplat.scene.walls import enclosed_bounds, enclosure_box, walls_beside
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +77,7 @@ def make_static_scene(
     bounds, inner = [], []
     for number, (region, arrangements) in enumerate(scene.spec.all_regions):
         beside = walls_beside(scene.spec, number, names, walls)
-        low, high = enclosed_bounds(region, boxes, beside)
-        high[2] += PILE_HEIGHT if "pile" in arrangements else 0.0
-        bounds.append((low, high))
+        bounds.append(enclosed_bounds(region, arrangements, boxes, beside))
         inner.append(enclosure_box({names[wall]: boxes[wall] for wall in beside}))
     outer_low, outer_high = np.array(bounds).swapaxes(0, 1)
     inner_low, inner_high = np.array(inner).swapaxes(0, 1)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.rigid import homogeneous_matrix
-from mitsplat.scene.spec.object_spec import ObjectPose
+from mitsplat.scene.spec.object_spec import Arrangement, ObjectPose
 from mitsplat.scene.spec.scene_spec import BACKDROP, SceneSpec
 from mitsplat.scene.spec.shape_spec import Backdrop, Bin, Box, Enclosure, Region, Shape
 from mitsplat.storage.field_types import Vec3
@@ -167,19 +167,23 @@ def bin_walls(shape: Bin) -> tuple[trimesh.Trimesh, ...]:
 
 
 def enclosed_bounds(
-    region: Region, bounds: Sequence[Float64Array], walls: Sequence[int]
+    region: Region, arrangements: Sequence[Arrangement], bounds: Sequence[Float64Array], walls: Sequence[int]
 ) -> tuple[Float64Array, Float64Array]:
     """Return the corners of the box in which centres of mass must stay.
 
-    The box ends at the outer faces of the walls beside the region, or at the bounds of all colliders without walls.
+    The box ends at the outer faces of the walls beside the region, or at the bounds of all colliders without walls. It
+    contains the starts of a pile.
 
     Args:
         region: Region in which objects start.
+        arrangements: Possible arrangements in it.
         bounds: Bounding box of each collider, shape (2, 3) [m].
         walls: Indices of the colliders that are enclosure walls.
     """
     low, high = np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1]
     high[2] = max(high[2], region.max[2])
+    if "pile" in arrangements:
+        high[2] += PILE_HEIGHT
     for axis in (0, 1):
         across = 1 - axis
         for wall in (bounds[position] for position in walls):

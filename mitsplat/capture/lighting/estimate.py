@@ -28,6 +28,8 @@ _MEAN_LEVEL = 110.0
 _MIN_RADIUS = 20.0
 """Minimum radius of a ball in its photograph [px]; at this radius, 45 degrees around its rear are not visible."""
 _OUTLINE = (230, 40, 40)
+_TITLE = "# Captured light: "
+"""First characters of a file of lights."""
 
 
 @dataclass(frozen=True)
@@ -268,10 +270,6 @@ def refuse_to_replace(out: Path, images: Sequence[Path]) -> None:
         raise InputError(
             f"{there[0]}: already exists and was not written by `mitsplat lights`: give another --out (got {out})"
         )
-
-
-_TITLE = "# Captured light: "
-"""First characters of a file of lights."""
 
 
 def light_lines(estimate: LightEstimate, image: str) -> str:

@@ -7,6 +7,7 @@ renders all of them in one Mitsuba variant. A process can only use one variant.
 
 from __future__ import annotations
 
+import faulthandler
 import sys
 import tempfile
 from collections.abc import Callable
@@ -31,6 +32,9 @@ from mitsplat.runtime.dropped_rays import check_dropped_rays
 from tests.renderer.test_light import WHITE_SKY, floor, nothing, slab
 
 SIZE = 160, 120
+MAX_SECONDS = 600
+"""Time after which rendering of all cases ends with the place where it stands; it takes one minute."""
+
 Arrays = dict[str, np.ndarray]
 
 
@@ -193,10 +197,12 @@ CASES: dict[str, Callable[[], Arrays]] = {
 
 def main() -> None:
     variant, out = sys.argv[1:]
+    faulthandler.dump_traceback_later(MAX_SECONDS, exit=True)
     mi.set_variant(variant)
     arrays = {f"{case}/{name}": value for case, make in CASES.items() for name, value in make().items()}
     check_dropped_rays()
     np.savez(out, **arrays)
+    faulthandler.cancel_dump_traceback_later()
 
 
 if __name__ == "__main__":

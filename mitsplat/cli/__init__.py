@@ -22,6 +22,7 @@ import typer
 from typer.core import TyperGroup
 
 from mitsplat.cli import assets, datasets, detectors, fault, inspection, lights, machine, photographs
+from mitsplat.cli.interrupt import handle_interrupts
 from mitsplat.errors import LateDeviceError, exit_status, sentence_of
 from mitsplat.runtime.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.storage.file_kinds import check_path_encoding
@@ -110,6 +111,7 @@ def main(args: Sequence[str] | None = None) -> None:
         args: Arguments; those of the process if None.
     """
     if args is None:
+        handle_interrupts()
         leave_current_folder()
     try:
         for name in (*(sys.argv[1:] if args is None else args), os.fspath(Path.cwd())):

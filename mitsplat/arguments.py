@@ -95,7 +95,7 @@ def check_list(value: object, kind: type, place: str) -> None:
 
 
 def real_array(value: npt.ArrayLike, kind: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
-    """Return an argument of the Python API as a new array of real numbers.
+    """Return an argument of the Python API as a new array of real numbers, of any shape.
 
     Raises:
         TypeError, ValueError: If it has other values, such as text or complex numbers, or masked ones, which NumPy

@@ -167,7 +167,7 @@ class DecodedFrame:
 
 
 def bounds_of(mask: BoolArray) -> Box:
-    """Return the bounds of a mask's pixels; all are 0 for an empty mask."""
+    """Return the bounds of the pixels of a mask (H, W); all are 0 for an empty mask."""
     ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (int(xs[0]), int(ys[0]), int(xs[-1]) + 1, int(ys[-1]) + 1) if len(xs) else (0, 0, 0, 0)
 

@@ -68,7 +68,7 @@ def _check_semantic(frame: DecodedFrame, path: Path) -> Iterator[str]:
 
 
 def segment_picture(frame: DecodedFrame, path: Path) -> Int64Array | None:
-    """Read the ids of a panoptic picture, R + 256 G + 65536 B as in panopticapi."""
+    """Read the ids (H, W) of a panoptic picture, R + 256 G + 65536 B as in panopticapi."""
     picture = read_picture(path)
     if picture is None or picture.shape[:2] != frame.size[::-1]:
         return None

@@ -82,7 +82,7 @@ def _check_segment(frame: DecodedFrame, label: DecodedInstance, values: list[flo
 
 
 def bridged_pixels(mask: BoolArray) -> int:
-    """Return the minimum number of gap pixels that join all parts of a mask, in chessboard distance."""
+    """Return the minimum number of gap pixels that join all parts of a mask (H, W), in chessboard distance."""
     count, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     trees = [KDTree(np.argwhere(parts == part)) for part in range(1, count)]
     distances = np.zeros((len(trees), len(trees)))

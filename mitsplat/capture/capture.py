@@ -61,7 +61,7 @@ class PhotoPixels(NamedTuple):
 
 
 class SizedPhoto(NamedTuple):
-    """Camera and pixels of a reduced photo, as in :class:`PhotoPixels`."""
+    """Camera of H x W pixels of a reduced photo, and its pixels as in :class:`PhotoPixels`."""
 
     camera: Camera
     rgb: Float32Array
@@ -112,7 +112,7 @@ class Photo:
     def read_mask(
         self, scale: float = 1.0, window: Window | None = None
     ) -> tuple[Float32Array | None, Float32Array | None]:
-        """Read only the mask and the hidden area of :meth:`read`."""
+        """Read only the mask and the hidden area of :meth:`read`, shape (H, W) each."""
         if self.mask is None:
             return None, None
         values = self._read_pixels(self.mask, ("L", "LA"), scale, window)

@@ -279,7 +279,7 @@ def mask_files(folder: Path) -> dict[str, Path]:
 
 
 def read_mask(files: Mapping[str, Path], photo: Prepared) -> BoolArray | None:
-    """Read the mask of a photo in the size of its copy; None if there is none.
+    """Read the mask of a photo in the size (H, W) of its copy; None if there is none.
 
     A mask file is ``<photo>.png``, with or without the photo's own suffix, in any case. White marks the object; in a
     picture with transparency, opaque pixels do. A mask has the orientation of the copy: as viewers show the photo, or,

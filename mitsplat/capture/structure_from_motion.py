@@ -74,7 +74,7 @@ class SparseModel:
         cameras: Cameras of the registered images, by file name.
         points: Triangulated points, shape (N, 3).
         colours: 8-bit colours of the points, shape (N, 3).
-        seen: Indices of the points that each image observes.
+        seen: Indices of the points that each image observes, shape (K,) each.
         elsewhere: Names of images that only smaller models contain.
         reprojection_error: Mean reprojection error over all observations [px].
         agreement: Fraction of each image's matches that agree with its camera; 1 where unknown.

@@ -269,7 +269,7 @@ def _colliders(scene: Scene) -> Iterator[tuple[str, trimesh.Trimesh]]:
 
 
 def reachable_box(scene: Scene) -> tuple[Float64Array, Float64Array]:
-    """Return the corners of a box [m] that contains every point that objects can reach.
+    """Return the corners, (3,) each, of a box [m] that contains every point that objects can reach.
 
     An object that leaves the box causes its layout to be drawn again.
     """

@@ -178,7 +178,7 @@ def match_boxes(found: Sequence[Sequence[float]], labelled: Sequence[Sequence[fl
 def overlaps(
     found: Sequence[Sequence[float]], labelled: Sequence[Sequence[float]], crowds: Sequence[bool] | None = None
 ) -> Float64Array:
-    """Compute the IoU of detected boxes (rows) with labelled boxes (columns); by default no label is a crowd."""
+    """Compute the IoU (N, M) of N detected boxes with M labelled ones; by default no label is a crowd."""
     if not found or not labelled:
         return np.zeros((len(found), len(labelled)))
     boxes = (np.array(those, dtype=np.float64) for those in (found, labelled))

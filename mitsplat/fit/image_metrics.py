@@ -8,7 +8,7 @@ from skimage.metrics import structural_similarity
 
 
 def psnr(seen: npt.NDArray[np.floating], truth: npt.NDArray[np.floating]) -> float:
-    """Return the peak signal-to-noise ratio [dB] of pictures with values in [0, 1]."""
+    """Return the peak signal-to-noise ratio [dB] of pictures of one shape with values in [0, 1]."""
     return psnr_of(float(np.mean((seen - truth) ** 2)))
 
 

@@ -96,7 +96,7 @@ class Adam:
         """Replace the parameters by a selection of their rows.
 
         Args:
-            rows: Indices of the rows; they may repeat.
+            rows: Indices of the rows, shape (N,); they may repeat.
             widths: Floats per row, by parameter.
             fresh: True for rows whose moments are reset, shape of ``rows``.
         """

@@ -209,7 +209,10 @@ def _replace_rows(model: GaussianModel, rows: npt.NDArray[np.intp], opacities: F
 
 
 def split_opacity(opacities: Float64Array, copies: npt.NDArray[np.intp]) -> tuple[Float64Array, Float64Array]:
-    """Return the opacity of each of n coincident Gaussians that replace one, and the factor on its scales (eq. 9)."""
+    """Return the opacity of each of n coincident Gaussians that replace one, and the factor on its scales (eq. 9).
+
+    ``opacities`` and ``copies`` (n) have the shape (N,), and so have the results.
+    """
     copies = np.minimum(copies, _COPIES_MAX)
     opacity = 1 - (1 - opacities) ** (1 / copies)
     total = np.zeros(len(opacities))

@@ -220,7 +220,7 @@ def write_panoptic(files: FrameFiles) -> None:
 
 
 def environment_segment(labels: Labels, ids: npt.NDArray[np.integer]) -> JsonObject | None:
-    """Return id, area and box of the pixels where an id map is 0, or None if there are none."""
+    """Return id, area and box of the pixels where an id map (H, W) is 0, or None if there are none."""
     ys, xs = np.nonzero(ids == 0)
     if not len(ys):
         return None

@@ -177,7 +177,7 @@ class FrameFiles:
         self.add(file, lambda path: path.write_bytes(content))
 
     def add_png(self, file: str, picture: npt.NDArray[np.unsignedinteger]) -> None:
-        """Write a picture as PNG."""
+        """Write a picture (H, W) or (H, W, C) as PNG."""
         self.add_bytes(file, maps.encode_png(picture))
 
     def add_depth(self, file: str) -> None:

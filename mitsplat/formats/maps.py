@@ -42,7 +42,7 @@ def _encode(picture: npt.NDArray[np.unsignedinteger], suffix: str, options: list
 
 
 def encode_mask_png(mask: BoolArray, box: Box, size: tuple[int, int]) -> bytes:
-    """Encode a mask at ``box`` in an image of ``size`` (width, height) as an 8-bit grey PNG of 0 and 255.
+    """Encode a mask (H, W) at ``box`` in an image of ``size`` (width, height) as an 8-bit grey PNG of 0 and 255.
 
     Only the rows of the box are compressed, which takes a tenth of OpenCV's time for whole images. Parts of a deflate
     stream can be concatenated if each part begins after a full flush, and blank rows always compress to the same bytes.
@@ -93,7 +93,7 @@ def _deflated_zeros(count: int) -> bytes:
 
 
 def depth_scale(depth: npt.NDArray[np.floating]) -> float:
-    """Return the unit of the frame's depth picture [mm]."""
+    """Return the unit of the frame's depth picture [mm], from its depths (H, W) [m]."""
     farthest = float(depth.max(initial=0.0)) * 1000
     return next((scale for scale in DEPTH_SCALES if farthest <= 65535 * scale), DEPTH_SCALES[-1])
 

@@ -20,7 +20,7 @@ _GAP = 6
 
 
 def layer_sheet(frame: Frame) -> ByteImage:
-    """Draw a frame's picture, labels, ids, depth, light and highlight in a captioned grid, RGB."""
+    """Draw a frame's picture, labels, ids, depth, light and highlight in a captioned grid, RGB (H, W, 3)."""
     tiles = [draw_layer(frame, name) for name in LAYERS]
     height, width = frame.image.shape[:2]
     sheet = np.full((2 * (height + _CAPTION) + _GAP, 3 * width + 2 * _GAP, 3), 32, dtype=np.uint8)

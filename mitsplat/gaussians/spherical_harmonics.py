@@ -105,7 +105,7 @@ def sh_rotation(rotation: npt.ArrayLike, degree: int) -> Float64Array:
 
 
 def encode_sh(sh: Float32Array) -> Float32Array:
-    """Return coefficients of display-encoded colours from those of linear colours.
+    """Return coefficients (N, K, 3) of display-encoded colours from those of linear colours.
 
     The constant band is exact. The others are multiplied by the slope of the encoding at the mean colour.
     """

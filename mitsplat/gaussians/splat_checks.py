@@ -33,6 +33,9 @@ _COLOUR_SPACE = "color_space"
 def check_encoding(means: Float32Array, scales: Float32Array, opacities: Float32Array, colours: Float32Array) -> None:
     """Refuse sizes, opacities and colours in place of the logarithms, logits and coefficients of a PLY file.
 
+    The arrays are those of N Gaussians before activation: means and scales (N, 3), opacities (N, 1),
+    colours (N, 3).
+
     Trained splats have logits outside of 0 to 1, and most of their Gaussians are smaller than the cloud. A file is
     refused in five cases:
 

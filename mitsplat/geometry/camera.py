@@ -145,9 +145,9 @@ class Camera:
         distortion: npt.ArrayLike = (),
         near: float = NEAR,
     ) -> Camera:
-        """Create a camera at ``eye`` [m] that faces ``target`` [m].
+        """Create a camera at ``eye`` (3,) [m] that faces ``target`` (3,) [m], with ``up`` (3,) upwards in the image.
 
-        The horizontal field of view is ``fov_x`` [degrees].
+        The horizontal field of view is ``fov_x`` [degrees]. The other arguments are those of :class:`Camera`.
 
         Raises:
             ValueError: If ``eye`` equals ``target`` or ``fov_x`` is not between 0 and 180.
@@ -187,7 +187,8 @@ class Camera:
     ) -> Camera:
         """Create a camera from a pose in OpenGL's axes (x right, y up, z backwards), as in Blender and NeRF datasets.
 
-        The intrinsics are those of :class:`Camera`: in pixels, with y downwards.
+        ``world_from_camera`` is a rigid transform (4, 4). The intrinsics are those of :class:`Camera`: in pixels, with
+        y downwards.
 
         Raises:
             ValueError: As for :class:`Camera`. A matrix in OpenGL's column-major order must be transposed first.

@@ -46,7 +46,7 @@ class Silhouette:
 
     @classmethod
     def cropped(cls, mask: BoolArray, x: int, y: int) -> Silhouette:
-        """Return the silhouette of a non-empty mask whose first pixel is at (x, y)."""
+        """Return the silhouette of a non-empty mask (H, W) whose first pixel is at (x, y)."""
         ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
         return cls((x + x0, y + y0, x + x1, y + y1), np.ascontiguousarray(mask[y0:y1, x0:x1]))
@@ -75,7 +75,7 @@ class Silhouette:
 
 
 def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
-    """Return COCO's compressed run-length code of a mask at ``box`` in an image of ``size`` (width, height).
+    """Return COCO's compressed run-length code of a mask (H, W) at ``box`` in an image of ``size`` (width, height).
 
     Runs go down the columns. Only the box is processed, which takes a tenth of the time of pycocotools on whole images.
     """
@@ -99,7 +99,7 @@ def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
 
 
 def boundary_f1(one: BoolArray, other: BoolArray) -> float:
-    """Return the F1 score of the boundaries of two masks.
+    """Return the F1 score of the boundaries of two masks (H, W).
 
     Boundary pixels within :data:`BOUNDARY_TOLERANCE` of the other boundary count as matches. Source: Csurka et al.
     2013, "What is a good evaluation measure for semantic segmentation?". The boundary of a mask consists of its pixels
@@ -118,7 +118,7 @@ def boundary_f1(one: BoolArray, other: BoolArray) -> float:
 
 
 def disc(radius: int) -> npt.NDArray[np.uint8]:
-    """Return a disc with a radius [px] as a structuring element of OpenCV."""
+    """Return a disc with a radius r [px] as a structuring element of OpenCV, shape (2 r + 1, 2 r + 1)."""
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2), dtype=np.uint8)
 
 
@@ -133,7 +133,7 @@ def border_of(image: AnyArray) -> AnyArray:
 
 
 def without_fragments(mask: BoolArray, min_fragment: int) -> tuple[BoolArray, int]:
-    """Remove connected parts with fewer than ``min_fragment`` pixels.
+    """Remove connected parts with fewer than ``min_fragment`` pixels from a mask (H, W).
 
     Returns:
         The mask, and the number of removed parts.

@@ -17,7 +17,7 @@ MAX_FILE_BYTES = 1 << 29
 
 
 def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> AnyArray | None:
-    """Return the pixels of an image file as ``cv2.imread`` does.
+    """Return the pixels (H, W) or (H, W, C) of an image file as ``cv2.imread`` does.
 
     Returns:
         None if the file cannot be read, is no image, or has more bytes than :data:`MAX_FILE_BYTES` or more pixels than

@@ -44,7 +44,7 @@ class Cleaner:
         return self._all.select(~self._remaining)
 
     def remove(self, reason: str, which: BoolArray, otherwise: str) -> None:
-        """Remove some of the remaining Gaussians, and raise an error if none would remain."""
+        """Remove remaining Gaussians by a mask (N,), and raise the error ``otherwise`` if none would remain."""
         self.removed[reason] = self.removed.get(reason, 0) + int(which.sum())
         self._remaining[np.flatnonzero(self._remaining)[which]] = False
         if not self._remaining.any():

@@ -76,7 +76,7 @@ class Upright:
 
 
 def axis_vector(axis: str) -> Float64Array:
-    """Return the unit vector of an axis such as ``-y``.
+    """Return the unit vector (3,) of an axis such as ``-y``.
 
     Raises:
         InputError: If the name is no axis.

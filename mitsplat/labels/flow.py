@@ -96,7 +96,7 @@ def exposure_flow(
 
 
 def instance_motions(layout: Layout, next_layout: Layout) -> dict[int, Float64Array | None]:
-    """Compute the motions of instances between two layouts, for :func:`optical_flow`."""
+    """Compute the motions (4, 4) of instances between two layouts, for :func:`optical_flow`."""
     motions: dict[int, Float64Array | None] = {}
     next_poses = {instance.id: instance.world_from_object for instance in next_layout.instances}
     for instance in layout.instances:

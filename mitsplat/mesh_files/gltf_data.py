@@ -212,7 +212,7 @@ class GltfData:
 
 
 def normalised(values: AnyArray) -> AnyArray:
-    """Return integers as floats of at most 1 (glTF 2.0, 3.11); floats are not changed."""
+    """Return integers of any shape as floats of at most 1 (glTF 2.0, 3.11); floats are not changed."""
     if values.dtype.kind == "f":
         return values
     return np.asarray(np.maximum(values / float(np.iinfo(values.dtype).max), -1.0))

@@ -38,7 +38,7 @@ def world_poses(data: GltfData) -> dict[int, Float64Array]:
 
 
 def instance_poses(data: GltfData, node: JsonObject) -> list[Float64Array]:
-    """Return the poses of the instances of a node, relative to it (``EXT_mesh_gpu_instancing``)."""
+    """Return the poses (4, 4) of the instances of a node, relative to it (``EXT_mesh_gpu_instancing``)."""
     stored = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
     if stored is None:
         return [np.eye(4)]

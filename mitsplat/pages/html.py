@@ -65,7 +65,7 @@ def inline_image(pixels: AnyArray) -> str:
 
 
 def shrunk_image(picture: ByteImage, width: int) -> str:
-    """Encode a picture in red, green, blue order as a data URL, at most ``width`` px wide."""
+    """Encode an RGB picture (H, W, 3) as a data URL, at most ``width`` px wide."""
     scale = min(1.0, width / picture.shape[1])
     size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
     return inline_image(cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR))
@@ -77,7 +77,7 @@ def rgb_image(values: npt.NDArray[np.floating], width: int) -> str:
 
 
 def colour_bytes(values: npt.NDArray[np.floating]) -> ByteImage:
-    """Convert colours from 0 to 1 to bytes."""
+    """Convert colours from 0 to 1 to bytes, in any shape."""
     return np.asarray(255 * np.clip(values, 0, 1) + 0.5).astype(np.uint8)
 
 

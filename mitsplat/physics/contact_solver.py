@@ -40,7 +40,7 @@ class PairContactSolver(SolverMuJoCo):
             self._velocities = wp.zeros_like(self.mjw_data.qvel)
 
     def geom_restitution(self) -> Float64Array:
-        """Return the coefficients of restitution of MuJoCo's geoms in one world."""
+        """Return the coefficients of restitution (G,) of MuJoCo's geoms in one world."""
         shapes: Any = self.mjc_geom_to_newton_shape  # every finished model has these arrays
         restitution: Any = self.model.shape_material_restitution
         return np.asarray(restitution.numpy()[shapes.numpy()[0]], dtype=np.float64)

@@ -41,7 +41,7 @@ class Item:
         asset: Index of its asset in the scene; a stack consists of one asset.
         surface: Its mesh.
         outline: Vertices of its convex hull [m], shape (N, 3).
-        pose: Pose from the scene file, or None.
+        pose: Pose from the scene file, shape (4, 4), or None.
         region: Index of its start region.
     """
 

@@ -36,7 +36,7 @@ class StartPoses:
     def items(
         self, assets: Sequence[int], given: Sequence[Float64Array | None] = (), regions: Sequence[int] | None = None
     ) -> list[Item]:
-        """Return the objects to place, with poses from the scene file and start regions."""
+        """Return the objects to place, with poses (4, 4) from the scene file and start regions."""
         return [
             Item(
                 asset,

@@ -55,7 +55,7 @@ class World(ABC):
         self.set_forces(np.zeros((len(self.bodies), 2, 3)))
 
     def set_velocities(self, velocities: Float64Array) -> None:
-        """Set the velocities of the bodies, as in :attr:`velocities`; poses do not change."""
+        """Set the velocities of the bodies (N, 2, 3), as in :attr:`velocities`; poses do not change."""
         self._set_velocities(np.pad(velocities, ((0, -len(velocities) % BATCH), (0, 0), (0, 0))))
 
     def set_forces(self, forces: Float64Array) -> None:

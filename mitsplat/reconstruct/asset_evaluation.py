@@ -87,7 +87,7 @@ class AssetView:
         return np.asarray(self.render + 0.5 * (1 - self.alpha[..., None]), dtype=np.float32)
 
     def shaded(self, behind: Float32Array | float, share: float = 1.0) -> Float32Array:
-        """Return the mesh, lit from the camera, over ``behind``; ``share`` is the opacity of the mesh."""
+        """Return the mesh, lit from the camera, over ``behind`` (H, W, 3); ``share`` is the opacity of the mesh."""
         towards = -self.camera.world_from_camera[:3, 2]
         light = 0.25 + 0.75 * np.clip(self.normal @ towards, 0, 1)
         grey = np.repeat(light[..., None], 3, axis=2) * (1.0, 0.75, 0.45)
@@ -282,7 +282,7 @@ def is_closed(mesh: trimesh.Trimesh) -> bool:
 
 
 def iou(one: BoolArray, other: BoolArray) -> float:
-    """Return the intersection over union; 1 if both are empty."""
+    """Return the intersection over union of two masks (H, W); 1 if both are empty."""
     union = int((one | other).sum())
     return int((one & other).sum()) / union if union else 1.0
 

@@ -117,7 +117,7 @@ class MaskBoundary:
         return np.abs(self.distances(pixels)) + 1 < _interpolated(self._to_unknown, pixels)
 
     def overlap(self, outlines: MeshOutlines, motion: Float64Array) -> float:
-        """Return the IoU of the silhouette of the moved mesh with the mask, by coverage of known pixels."""
+        """Return the IoU of mask and silhouette of the mesh after ``motion`` (4, 4), by coverage of known pixels."""
         share = outlines.coverage(self.camera.transformed(np.linalg.inv(motion)))
         both, either = (float(pick(share, self._mask)[self._known].sum()) for pick in (np.minimum, np.maximum))
         return both / max(either, 1e-9)

@@ -256,7 +256,7 @@ class Silhouettes:
         return total
 
     def overlaps(self, vertices: Float64Array, views: Sequence[Outline]) -> Float64Array:
-        """Return the IoU of silhouette and mask per view, computed with fractional pixel coverage."""
+        """Return the IoU (V,) of silhouette and mask in V views, by pixel coverage, for vertices (N, 3)."""
         self.set_vertices(wrapped(mi.Float, vertices.ravel().astype(np.float32)))
         overlaps = []
         for view in views:

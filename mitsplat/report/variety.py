@@ -200,7 +200,7 @@ class _Sample:
 
 
 def cell_of(direction: Float64Array) -> tuple[int, int]:
-    """Return ring, from the top down, and sector of a direction; both hemispheres have :data:`RINGS` rings."""
+    """Return ring, from the top down, and sector of a direction (3,); both hemispheres have :data:`RINGS` rings."""
     x, y, z = direction / max(float(np.linalg.norm(direction)), 1e-12)
     ring = int((1 - z) / 2 * 2 * RINGS)
     sector = int((math.atan2(y, x) / math.tau % 1) * SECTORS)

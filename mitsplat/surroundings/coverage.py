@@ -128,7 +128,7 @@ def _to_scene(support: Support, flat: Float64Array) -> Float64Array:
 
 
 def free_rectangle(free: BoolArray) -> tuple[int, int, int, int] | None:
-    """Return the largest rectangle of True cells as first row, end row, first column and end column, or None.
+    """Return the largest rectangle of True cells (H, W): first row, end row, first column and end column, or None.
 
     The ends are exclusive.
     """

@@ -118,7 +118,7 @@ class Grid:
         return np.concatenate([np.zeros((0, 3)), *columns])
 
     def outline(self, points: Float64Array) -> BoolArray:
-        """Return the covered cells of one object, with holes filled."""
+        """Return the cells (X, Y) that the points (N, 3) of one object cover, with holes filled."""
         return np.asarray(binary_fill_holes(self.covered(points)))
 
     def bare_colours(self, splats: Splats, cameras: Sequence[Camera], height: float) -> tuple[Float64Array, BoolArray]:

@@ -59,8 +59,8 @@ class RemovedObject:
         pick: The pick as given.
         support: Index of its support.
         gaussians: Number of its Gaussians.
-        low: Least x, y and z of its visible points.
-        high: Largest x, y and z of its visible points.
+        low: Least x, y and z of its visible points, shape (3,).
+        high: Largest x, y and z of its visible points, shape (3,).
         filled: Centres of the filled cells, (N, 2).
         area: Area of these cells.
         behind: Filled area on walls behind it.

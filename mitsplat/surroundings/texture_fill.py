@@ -116,5 +116,5 @@ def _membrane(values: Float64Array, border: BoolArray, inside: BoolArray) -> Flo
 
 
 def dilated(cells: BoolArray, steps: int) -> BoolArray:
-    """Return all cells within ``steps`` of the given cells."""
+    """Return all cells (X, Y) within ``steps`` of the given cells."""
     return np.asarray(distance_transform_edt(~cells) <= steps) if cells.any() else cells

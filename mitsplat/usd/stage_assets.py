@@ -88,7 +88,7 @@ def read_stage_asset(path: Path) -> StageAsset:
 
 
 def body_frames(path: Path, bodies: Sequence[Record]) -> dict[str | None, Float64Array]:
-    """Return the rigid frames ``world_from_body`` of rigid bodies, without the scale of their prims."""
+    """Return the rigid frames ``world_from_body`` (4, 4) of rigid bodies, without the scale of their prims."""
     return {body["path"]: rigid_frame(path, body)[0] for body in bodies}
 
 
@@ -106,7 +106,7 @@ def rigid_frame(path: Path, record: Record) -> tuple[Float64Array, float]:
 
 
 def merge_fields(path: Path, fields: Sequence[Record], frame_from_world: Float64Array) -> tuple[Splats, list[str]]:
-    """Return the splats of particle fields in one frame, and notes on values that were changed."""
+    """Return the splats of particle fields in a frame, by its transform (4, 4), and notes on changed values."""
     notes: list[str] = []
     parts = []
     for field in fields:
@@ -240,7 +240,7 @@ def _inertia_notes(path: Path, asset: Asset, body: Record) -> list[str]:
 
 
 def placed_mesh(record: Record, frame_from_world: Float64Array) -> trimesh.Trimesh:
-    """Return the mesh of a record in a frame [m]."""
+    """Return the mesh of a record in a frame [m], which ``frame_from_world`` (4, 4) defines."""
     mesh = trimesh.Trimesh(record["points"], record["faces"], process=False)
     mesh.apply_transform(frame_from_world @ record["matrix"])
     return mesh

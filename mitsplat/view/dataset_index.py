@@ -98,7 +98,7 @@ class DatasetIndex:
         raise InputError(f"{self._root}: the record of frame {index} cannot be read")
 
     def picture(self, index: int, overlay: OverlayName = "labels") -> tuple[str, ByteImage]:
-        """Return a caption and the RGB image of a frame with its labels drawn on it.
+        """Return a caption and the RGB image (H, W, 3) of a frame with its labels drawn on it.
 
         Raises:
             InputError: If the image is missing, unreadable, or not a file of the dataset.

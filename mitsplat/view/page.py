@@ -170,7 +170,7 @@ class Page:
         )
 
     def show_picture(self, image: ByteImage, caption: str) -> None:
-        """Show a picture beside the parts, with a caption in Markdown."""
+        """Show an RGB picture (H, W, 3) beside the parts, with a caption in Markdown."""
         self._picture.image, self._picture.visible = image, True
         self._caption.content = caption
 

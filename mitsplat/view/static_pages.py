@@ -258,7 +258,7 @@ class DatasetPage(StaticPage):
 
 
 def photo_picture(photo: Photo, *, masked: bool) -> ByteImage:
-    """Return a photo in the size of the page; if ``masked``, its background is darkened.
+    """Return a photo (H, W, 3) in the size of the page; if ``masked``, its background is darkened.
 
     Raises:
         InputError: If it cannot be read.

@@ -38,7 +38,7 @@ def seed_line(seed: int) -> str:
 
 
 def rounded(vector: npt.ArrayLike) -> tuple[float, ...]:
-    """Round coordinates [m] to a tenth of a millimetre."""
+    """Round coordinates (3,) [m] to a tenth of a millimetre."""
     return tuple(round(float(value), 4) + 0.0 for value in np.asarray(vector))  # no negative zero
 
 

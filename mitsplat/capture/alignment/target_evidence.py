@@ -48,7 +48,7 @@ class FrameEvidence:
     Attributes:
         scale: Metres per unit of the model, or None.
         scale_error: Estimated relative standard error of the scale, or None.
-        plane: Normal and point of a horizontal plane, or None.
+        plane: Normal and point of a horizontal plane, shape (3,) each, or None.
         source, wrong, confirmed: As in :class:`~mitsplat.capture.alignment.metric_frame.MetricFrame`.
         board: Pose of the board [units of the model], shape (4, 4), or None.
     """

@@ -80,7 +80,7 @@ class Board:
         return np.asarray(places * self.square)
 
     def draw(self, dots: int) -> npt.NDArray[np.uint8]:
-        """Draw the board without a margin, 8-bit grey.
+        """Draw the board without a margin, 8-bit grey, shape (H, W).
 
         Args:
             dots: Edge of a square in pixels.
@@ -126,10 +126,10 @@ class Board:
             raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
     def find(self, grey: npt.NDArray[np.uint8]) -> dict[int, Float64Array]:
-        """Detect the inner corners of the board in an image.
+        """Detect the inner corners of the board in a grey image (H, W).
 
         Returns:
-            Pixel positions by index of the corner; pixel centres are at +0.5.
+            Pixel positions (2,) by index of the corner; pixel centres are at +0.5.
         """
         # Markers of few pixels are detected only in enlarged images.
         factor = 2 if max(grey.shape) < _SMALL else 1

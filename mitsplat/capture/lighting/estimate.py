@@ -113,16 +113,16 @@ class LightEstimate:
 
     @property
     def irradiance(self) -> Float64Array:
-        """Irradiance of a horizontal plane by all light, linear RGB [W/m^2]."""
+        """Irradiance of a horizontal plane by all light, linear RGB [W/m^2], shape (3,)."""
         return level_irradiance(self.panorama)
 
     @property
     def ambient(self) -> Float64Array:
-        """Irradiance of a horizontal plane by the light without the lamps, linear RGB [W/m^2]."""
+        """Irradiance of a horizontal plane by the light without the lamps, linear RGB [W/m^2], shape (3,)."""
         return level_irradiance(self.rest)
 
     def share(self, irradiance: Float64Array) -> float:
-        """Return the luminance of an irradiance as a fraction of that of all light."""
+        """Return the luminance of an irradiance (3,) as a fraction of that of all light."""
         return float(irradiance @ LUMINANCE / (self.irradiance @ LUMINANCE))
 
 
@@ -228,7 +228,7 @@ def write_light(estimate: LightEstimate, out: Path, photograph: ByteImage | None
         estimate: Light to write.
         out: Path NAME.yaml. The other files are NAME_panorama.exr with all light, NAME_rest.exr with the light without
             the lamps (if the lines reference it), and NAME.png.
-        photograph: Photograph to show in the picture beside the panorama.
+        photograph: Photograph (H, W, 3) to show in the picture beside the panorama.
 
     Returns:
         The written files.
@@ -295,7 +295,7 @@ def light_lines(estimate: LightEstimate, image: str) -> str:
 def area_line(
     position: Float64Array, target: Sequence[float] | Float64Array, size: tuple[float, float], radiance: Float64Array
 ) -> str:
-    """Return the entry of an area light in ``lights``."""
+    """Return the entry of an area light in ``lights``: centre and target [m], width and height [m], and linear RGB."""
     return (
         f"  - {{kind: area, position: {list_of(position)}, target: {list_of(target)}, "
         f"size: {list_of(size)}, {radiance_keys(radiance)}}}"
@@ -303,7 +303,7 @@ def area_line(
 
 
 def radiance_keys(rgb: Float64Array) -> str:
-    """Return the keys of a radiance: its luminance, and its colour of luminance 1."""
+    """Return the keys of a radiance (3,): its luminance, and its colour of luminance 1."""
     luminance = float(rgb @ LUMINANCE)
     return f"radiance: {luminance:.5g}, colour: {list_of(rgb / luminance)}"
 

@@ -50,10 +50,10 @@ class Lamp:
     """Rectangular lamp that faces the origin of the panorama, with its width horizontal.
 
     Attributes:
-        direction: Unit vector to its centre.
+        direction: Unit vector to its centre, shape (3,).
         extents: Width and height divided by its distance.
         radiance: Linear RGB in excess of the surroundings, which remain in the panorama [W/(m^2 sr)].
-        irradiance: Irradiance of a horizontal plane by the lamp, linear RGB [W/m^2].
+        irradiance: Irradiance of a horizontal plane by the lamp, linear RGB [W/m^2], shape (3,).
         pixels: Pixels of the lamp in the panorama, (H, W).
     """
 
@@ -75,7 +75,7 @@ class Lamp:
 
     @property
     def colour(self) -> Float64Array:
-        """Linear RGB, scaled to luminance 1."""
+        """Linear RGB, scaled to luminance 1, shape (3,)."""
         return self.radiance / self.luminance
 
     @property
@@ -197,7 +197,7 @@ def rectangle_irradiance(direction: Float64Array, extents: tuple[float, float]) 
     at distance 1 by the midpoint rule.
 
     Args:
-        direction: Direction to the centre of the rectangle.
+        direction: Unit vector to the centre of the rectangle, shape (3,).
         extents: Width and height divided by the distance.
     """
     steps = (np.arange(_GRID) + 0.5) / _GRID - 0.5

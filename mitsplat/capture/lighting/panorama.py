@@ -71,13 +71,13 @@ def rotated(panorama: Float32Array, rotation: Float64Array) -> Float32Array:
 
 
 def unit_vector(azimuth: float, elevation: float) -> Float64Array:
-    """Return the direction of an azimuth and an elevation [degrees]."""
+    """Return the direction (3,) of an azimuth and an elevation [degrees]."""
     turn, rise = np.radians([azimuth, elevation])
     return np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
 
 
 def angles(direction: npt.ArrayLike) -> tuple[float, float]:
-    """Return azimuth, 0 to 360, and elevation [degrees] of a direction."""
+    """Return azimuth, 0 to 360, and elevation [degrees] of a direction (3,)."""
     x, y, z = np.asarray(direction, dtype=np.float64)
     return float(np.degrees(np.arctan2(y, x)) % 360), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 

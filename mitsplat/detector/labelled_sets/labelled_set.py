@@ -176,7 +176,7 @@ def ascii_rle(rle: JsonObject) -> JsonObject:
 
 
 def clip_points(points: Float64Array, size: tuple[int, int], place: str) -> Float64Array:
-    """Return points [px] clipped to the image.
+    """Return points (N, 2) [px] clipped to the image.
 
     Raises:
         InputError: If a point lies farther than ``_OUTSIDE_TOLERANCE`` outside the image.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def draw_objects(scene: Scene, layout: int) -> tuple[tuple[int, ...], tuple[Float64Array | None, ...]]:
-    """Return, for each object of a layout, the index of its asset and the pose that the scene file states, or None."""
+    """Return the index of the asset of each object of a layout, and its pose (4, 4) in the scene file, or None."""
     assets: list[int] = []
     given: list[Float64Array | None] = []
     for position, (entry, count) in enumerate(zip(scene.spec.objects, _counts(scene.spec, layout), strict=True)):

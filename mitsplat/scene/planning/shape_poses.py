@@ -36,7 +36,7 @@ class PlacedShape:
 
     @cached_property
     def bounds(self) -> tuple[Float64Array, Float64Array]:
-        """Lower and upper corner of the bounding box of ``mesh`` [m]; trimesh hashes the vertices at each access."""
+        """Corners (2, 3) of the bounding box of ``mesh`` [m]; trimesh hashes the vertices at each access."""
         low, high = self.mesh.bounds
         return low, high
 

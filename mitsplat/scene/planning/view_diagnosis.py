@@ -18,7 +18,7 @@ STEEP = 0.5
 
 
 def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
-    """Return True if a camera sees any part of a box; occluders are ignored.
+    """Return True if a camera sees any part of a box of corners (3,) [m]; occluders are ignored.
 
     A grid of points in the box detects boxes that are small in the image. A grid of camera rays detects large ones.
     """
@@ -38,12 +38,12 @@ def sees(camera: Camera, low: Float64Array, high: Float64Array) -> bool:
 
 
 def distance_to_box(point: Float64Array, low: Float64Array, high: Float64Array) -> float:
-    """Return the distance of a point from a box [m]; 0 inside."""
+    """Return the distance of a point (3,) from a box of corners (3,) [m]; 0 inside."""
     return float(np.linalg.norm(np.maximum(0, np.maximum(low - point, point - high))))
 
 
 def pose_cause(camera: Camera, low: Float64Array, high: Float64Array) -> str:
-    """Return the likely cause of a camera that does not see a box, as a question; empty if there is none.
+    """Return the likely cause, a question, of a camera that sees no box of corners (3,) [m]; empty if there is none.
 
     A cause is likely if the camera without it sees the box from outside, and not steeply from below. Of several causes,
     the one is taken with which the camera looks most directly at the middle of the box.

@@ -107,7 +107,7 @@ def _camera_of_frame(spec: SceneSpec, index: int, pose: Float64Array) -> tuple[C
 
 
 def camera_at(pose: Float64Array, intrinsics: Intrinsics, output: Output) -> Camera:
-    """Return a camera of the scene file at a pose, for images of the output's size.
+    """Return a camera of the scene file at a pose (4, 4), for images of the output's size.
 
     A rectified camera is the pinhole camera with the same intrinsic matrix.
 

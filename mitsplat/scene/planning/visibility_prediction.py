@@ -51,7 +51,8 @@ class ProjectedPoints:
     Attributes:
         camera: The camera.
         x, y, depth: Pixel positions [px] and depths [m] of the points, shape (P,).
-        raster: Mask of the points in front of the camera and in the image or a margin of one image size around it.
+        raster: Mask of the points in front of the camera and in the image or a margin of one image size around it,
+            shape (P,).
         cell_size: Size of the raster cells [px].
         within: Share of the surface of each object that is in front of the camera and in the image, shape (N,).
         outside_raster: Share of each object outside of the raster, shape (N,).

@@ -31,7 +31,7 @@ _HOME = {
     "Camera": "geometry.camera",
     "Capture": "capture.capture",
     "CaptureSettings": "capture.pipeline.capture_settings",
-    "FitSettings": "fit.trainer",
+    "FitSettings": "fit.fit_settings",
     "Frame": "frames.frame",
     "ImportSettings": "importing.splat_import",
     "InputError": "errors",
@@ -85,7 +85,7 @@ if TYPE_CHECKING:
     from mitsplat.errors import LateDeviceError as LateDeviceError
     from mitsplat.errors import MissingResourceError as MissingResourceError
     from mitsplat.errors import PartialResultError as PartialResultError
-    from mitsplat.fit.trainer import FitSettings as FitSettings
+    from mitsplat.fit.fit_settings import FitSettings as FitSettings
     from mitsplat.fit.trainer import fit_capture as fit_capture
     from mitsplat.frames.frame import Frame as Frame
     from mitsplat.frames.frame import Renderer as Renderer

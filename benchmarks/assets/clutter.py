@@ -32,7 +32,7 @@ from benchmarks.record import recording
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture, Photo, known_where
 from mitsplat.capture.pipeline.capture_settings import CaptureSettings
-from mitsplat.fit.trainer import FitSettings
+from mitsplat.fit.fit_settings import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
 from mitsplat.reconstruct.asset_evaluation import iou, show_asset

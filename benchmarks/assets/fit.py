@@ -31,9 +31,10 @@ from benchmarks.assets.photographed import photograph_asset
 from benchmarks.assets.strategy_classic import Classic
 from benchmarks.record import ROOT, figure, recording
 from mitsplat.capture.capture import Capture
+from mitsplat.fit.fit_settings import FitProgress, FitSettings
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.strategy_mcmc import seed_splats
-from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
+from mitsplat.fit.trainer import fit_capture
 from mitsplat.fit.training_view import TrainingView
 from mitsplat.runtime import recorded_kernels as recorded
 

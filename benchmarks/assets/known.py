@@ -32,7 +32,7 @@ from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.dataset.write import write_dataset
-from mitsplat.fit.trainer import FitSettings
+from mitsplat.fit.fit_settings import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.reconstruct.asset_evaluation import iou

@@ -46,7 +46,8 @@ from benchmarks.record import figure, recording
 from mitsplat.bake.mesh_surface import MeshSurface
 from mitsplat.bake.part_shapes import mitsuba_scene
 from mitsplat.capture.capture import Capture
-from mitsplat.fit.trainer import FitSettings, fit_capture
+from mitsplat.fit.fit_settings import FitSettings
+from mitsplat.fit.trainer import fit_capture
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.mesh_distance import DistanceSurface

@@ -33,7 +33,8 @@ from benchmarks.record import cpu_seconds, figure, recording
 from mitsplat.capture.pipeline.capture_pipeline import capture_photos
 from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.dataset.write import write_dataset
-from mitsplat.fit.trainer import FitSettings, fit_capture
+from mitsplat.fit.fit_settings import FitSettings
+from mitsplat.fit.trainer import fit_capture
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos

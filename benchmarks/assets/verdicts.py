@@ -35,7 +35,7 @@ from benchmarks.record import figure, recording
 from mitsplat.asset import Asset
 from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.errors import InputError
-from mitsplat.fit.trainer import FitSettings
+from mitsplat.fit.fit_settings import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.camera_poses import spiral
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, iou, show_asset

@@ -138,7 +138,8 @@ def fit(
     from mitsplat.capture.capture import Capture
     from mitsplat.fit.depth_network import model_maps
     from mitsplat.fit.depth_priors import find_maps
-    from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
+    from mitsplat.fit.fit_settings import FitProgress, FitSettings
+    from mitsplat.fit.trainer import fit_capture
 
     if depths is not None and depth_model is not None:
         raise InputError("--depths and --depth-model both define the depth maps: give only one")

@@ -8,6 +8,7 @@ The trainer starts from the points of the capture. A densification strategy (MCM
 from __future__ import annotations
 
 from mitsplat.fit.fit_folder import FitResult
-from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
+from mitsplat.fit.fit_settings import FitProgress, FitSettings
+from mitsplat.fit.trainer import fit_capture
 
 __all__ = ["FitProgress", "FitResult", "FitSettings", "fit_capture"]

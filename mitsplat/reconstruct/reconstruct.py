@@ -26,7 +26,8 @@ from mitsplat.reconstruct.pose_refinement import RefinedPose, refine_pose
 from mitsplat.reconstruct.registration import Alignment, measure_offset, register_mesh, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation, MaskedView, isolate_object
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, RefinedMesh, refine_mesh
-from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface, simplify_surface
+from mitsplat.reconstruct.simplification import simplify_surface
+from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from mitsplat.errors import InputError
 from mitsplat.fit import depth_network as depth_model
 from mitsplat.fit import depth_priors as depth_maps
 from mitsplat.fit.depth_priors import DepthMaps
-from mitsplat.fit.trainer import FitProgress, FitSettings
+from mitsplat.fit.fit_settings import FitProgress, FitSettings
 from mitsplat.reconstruct.asset_evaluation import Verdict
 from mitsplat.reconstruct.pipeline import asset_pipeline as pipeline
 from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult

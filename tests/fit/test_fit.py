@@ -23,9 +23,10 @@ from mitsplat.errors import InputError
 from mitsplat.fit import trainer as fit
 from mitsplat.fit.depth_priors import DepthMaps, align_maps
 from mitsplat.fit.fit_folder import FitResult
+from mitsplat.fit.fit_settings import FitProgress, FitSettings
 from mitsplat.fit.initial_points import seed_points
 from mitsplat.fit.photo_loss import depth_error, depth_image
-from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
+from mitsplat.fit.trainer import fit_capture
 from mitsplat.fit.training_view import TrainingView
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats

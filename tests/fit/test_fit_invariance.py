@@ -27,8 +27,9 @@ from scipy.spatial.transform import Rotation
 from mitsplat.capture.capture import Capture
 from mitsplat.fit import trainer as fit
 from mitsplat.fit.fit_folder import FitResult
+from mitsplat.fit.fit_settings import FitSettings
 from mitsplat.fit.image_metrics import psnr
-from mitsplat.fit.trainer import FitSettings, fit_capture
+from mitsplat.fit.trainer import fit_capture
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.layers import render_splats
 from tests.fit.test_fit import SMALL, photograph, seeing

@@ -11,7 +11,8 @@ from PIL import Image
 
 from mitsplat.capture.capture import Photo
 from mitsplat.fit.depth_priors import crop_map
-from mitsplat.fit.trainer import FitSettings, _training_view
+from mitsplat.fit.fit_settings import FitSettings
+from mitsplat.fit.trainer import _training_view
 from mitsplat.fit.windows import object_windows
 from mitsplat.geometry.camera import Camera
 

@@ -19,7 +19,7 @@ from mitsplat.capture.pipeline.capture_result import CaptureResult
 from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.fit_folder import FitResult
-from mitsplat.fit.trainer import FitSettings
+from mitsplat.fit.fit_settings import FitSettings
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface

@@ -19,7 +19,8 @@ from mitsplat.geometry.mesh import prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.reconstruct.registration import invert_transform, measure_offset, register_mesh, surface_points
-from mitsplat.reconstruct.surface import SurfaceSettings, _close_voids, reconstruct_surface, simplify_surface
+from mitsplat.reconstruct.simplification import simplify_surface
+from mitsplat.reconstruct.surface import SurfaceSettings, _close_voids, reconstruct_surface
 from tests.conftest import KnownObject
 
 

@@ -21,7 +21,8 @@ from mitsplat.capture.pipeline.capture_pipeline import capture_photos
 from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.errors import InputError
 from mitsplat.fit.fit_folder import FIT_FILE, read_record
-from mitsplat.fit.trainer import FitProgress, FitSettings, fit_capture
+from mitsplat.fit.fit_settings import FitProgress, FitSettings
+from mitsplat.fit.trainer import fit_capture
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.pages.html import REPORT_FILE
 from mitsplat.progress import Progress

@@ -312,10 +312,11 @@ def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> JsonObject:
 def first_difference(before: object, now: object, key: str = "") -> tuple[str, str, str] | None:
     """Return the first difference of two JSON values, or None if they are equal.
 
-    The difference is its dotted key and both values as JSON text; a missing value is ``null``.
+    The difference is its dotted key and both values as JSON text; a missing value is ``null``. Keys are compared in
+    their order, so that a key of the scene is named before the hash of the mesh that depends on it.
     """
     if isinstance(before, dict) and isinstance(now, dict):
-        for name in sorted({*before, *now}):
+        for name in {**before, **now}:
             inner = first_difference(before.get(name), now.get(name), f"{key}.{name}" if key else name)
             if inner is not None:
                 return inner

@@ -329,13 +329,20 @@ class TestRefusals:
         other = load_scene(scene.path, overrides={"output.width": 80})
         self.refuse(other, tmp_path / "out", r"scene\.output\.width was 64 and is 80")
 
+    def test_resuming_with_another_table_names_its_key(self, scene, scene_data, write_scene, tmp_path):
+        """The hash of its mesh, which differs too, would not say what to change back."""
+        write(scene, tmp_path / "out", frames=1)
+        scene_data["shapes"][0]["box"]["size"] = [1.5, 1, 0.1]
+        other = load_scene(write_scene(scene_data))
+        self.refuse(other, tmp_path / "out", r"scene\.shapes\[0\]\.box\.size\[0\] was 1\.0 and is 1\.5")
+
     def test_resuming_with_a_changed_asset_is_refused(self, scene, scene_data, write_scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         shutil.rmtree(tmp_path / "assets/nut")
         shutil.copytree(tmp_path / "assets/bolt", tmp_path / "assets/nut")
         manual = tmp_path / "assets/nut/asset.yaml"
         manual.write_text(manual.read_text().replace("bolt", "nut"))
-        self.refuse(load_scene(scene.path), tmp_path / "out", r"inputs\.objects\[0\]\.mesh was")
+        self.refuse(load_scene(scene.path), tmp_path / "out", r"inputs\.objects\[0\]\.splats was")
 
     def test_overwriting_replaces_all_images(self, scene, tmp_path):
         out = tmp_path / "out"

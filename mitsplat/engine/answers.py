@@ -80,9 +80,15 @@ class Failure:
 
 @dataclass(frozen=True)
 class Lost:
-    """Loss of a worker with its frame; ``how`` continues "the worker of frame 3 ..."."""
+    """Loss of a worker with its frame.
+
+    Attributes:
+        how: Description of its end, which continues "the worker of frame 3 ...".
+        cause: Possible cause, as a question.
+    """
 
     how: str
+    cause: str = "out of memory?"
 
 
 @dataclass(frozen=True)

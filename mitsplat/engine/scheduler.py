@@ -72,7 +72,7 @@ class _Scheduler(Generic[Result]):
                 elif worker not in self._at_work:
                     self._gone_at_start.pop(worker, None)  # died while idle
                 elif isinstance(answer, Lost):
-                    self._repeat_lost(worker, answer.how)
+                    self._repeat_lost(worker, answer)
                 elif isinstance(answer, Failure):
                     self._handle_failure(worker, answer)
                 else:
@@ -90,7 +90,7 @@ class _Scheduler(Generic[Result]):
             self._at_work[worker] = frame, time.monotonic()
             self._pool.send_frame(worker, frame, layout)
 
-    def _repeat_lost(self, worker: int, how: str) -> None:
+    def _repeat_lost(self, worker: int, lost: Lost) -> None:
         """Return the frame of a lost worker to the queue.
 
         Raises:
@@ -102,11 +102,11 @@ class _Scheduler(Generic[Result]):
         self._losses[frame] += 1
         if self._losses[frame] == MAX_LOSSES:
             raise LostWorkersError(
-                f"the worker of frame {frame} {how}, {MAX_LOSSES} times in a row (out of memory?); finished frames are "
-                "kept"
+                f"the worker of frame {frame} {lost.how}, {MAX_LOSSES} times in a row ({lost.cause}); finished frames "
+                "are kept"
             )
         self._queue.put_back(worker, frame)
-        self._note(f"the worker of frame {frame} {how}: the frame is repeated")
+        self._note(f"the worker of frame {frame} {lost.how}: the frame is repeated")
         self._grow = False
         if not self._at_work:
             self._assign(self._pool.start())

@@ -40,6 +40,9 @@ _POLL_INTERVAL = 1.0
 _MAX_ARGUMENTS = 1 << 14
 """Maximum length of a command line that is part of a worker's start data [bytes]."""
 
+_NO_GUARD = 'does the script start workers outside of `if __name__ == "__main__":`?'
+"""Possible cause of workers that end before their start: each of them runs the script again."""
+
 _END_TIMEOUT = 30.0
 """Time limit for the end of a worker that has closed its pipe [s]."""
 
@@ -157,9 +160,11 @@ class WorkerProcesses(Generic[Result]):
             try:
                 answer = pipe.recv()
             except (EOFError, OSError):
-                how = _describe_end(process)
+                lost = Lost(_describe_end(process))
+                if worker in self._starting and (process.exitcode or 0) > 0:
+                    lost = Lost(f"{lost.how} before its start", _NO_GUARD)
                 self.stop(worker)
-                yield worker, Lost(how)
+                yield worker, lost
                 continue
             if isinstance(answer, Started):
                 self._starting.pop(worker, None)

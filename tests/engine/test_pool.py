@@ -151,7 +151,7 @@ def interpreter(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("script", "words"),
     [
-        ("exit 7", "ended with status 7"),
+        ("exit 7", "ended with status 7 before its start"),
         ("kill -9 $$", "was killed by SIGKILL"),
         ("kill -STOP $$", "did not start within 0.5 s"),
     ],
@@ -171,6 +171,19 @@ def test_a_worker_that_does_not_start_in_time_is_reported(monkeypatch, interpret
         run(large, 2, {0: [0], 1: [1]}, notes.append)
     assert time.monotonic() - begun < 20
     assert re.fullmatch(rf"the worker of frame [01] {re.escape(words)}: the frame is repeated", notes[0])
+
+
+def test_a_script_without_a_guarded_main_part_is_named(tmp_path):
+    """Its workers run the script again and fail, which is no lack of memory."""
+    script = tmp_path / "script.py"
+    script.write_text("from tests.engine.test_pool import Make, run\nrun(Make(), 2)\n")
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, check=False, env=environment, timeout=100
+    )
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert re.search(r"ended with status 1 before its start, 3 times in a row \(.* outside of `if __name__ ==", last)
 
 
 @pytest.mark.parametrize(("arguments", "received"), [(["a", "b"], ("a", "b")), (["a" * 20_000], ())])

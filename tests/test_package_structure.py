@@ -169,7 +169,7 @@ def test_the_design_page_names_existing_modules() -> None:
     files = {path.relative_to(ROOT).as_posix() for path in MODULES.values()}
     files |= {
         path.relative_to(ROOT).as_posix()
-        for folder in ("tests", "benchmarks")
+        for folder in ("tests", "benchmarks", "docs")
         for path in ROOT.glob(f"{folder}/**/*.py")
     }
     for name in re.findall(r"`([\w/]+\.py)`", (ROOT / "docs/design.md").read_text()):

@@ -177,14 +177,9 @@ def compare_with_photographs(
         if progress is not None:
             progress(number, len(ours) + len(theirs), "measuring images")
         _measure(sample, number, size, sides[number >= len(ours)], hues[number >= len(ours)])
-
-    def traits_of(index: int | None) -> tuple[Trait, ...]:
-        shown = [key for key in _TRAITS if all(side.get((key, index)) for side in sides)]
-        return tuple(_trait(key, sides[0][key, index], sides[1][key, index]) for key in shown)
-
     least = MIN_RENDERED_OBJECTS, MIN_REAL_OBJECTS
     classes = {
-        name: traits_of(index)
+        name: _traits(sides, index)
         for index, name in enumerate(real.class_names)
         if all(len(side.get((BRIGHTNESS, index), [])) >= few for side, few in zip(sides, least, strict=True))
     }
@@ -193,13 +188,25 @@ def compare_with_photographs(
         for index, name in enumerate(real.class_names)
         if name in classes and (turn := _hue_shift(hues[0][index], hues[1][index])) is not None
     }
-    same_size, same_sizes = None, None
-    if ratios := _size_ratios(sides, len(real.class_names)):
-        least, same_size, most = (
-            max(round(size * ratio / STRIDE), 1) * STRIDE for ratio in np.quantile(ratios, [0, 0.5, 1])
-        )
-        same_sizes = least, most
-    return Likeness(len(ours), len(theirs), same_size, same_sizes, traits_of(None), classes, turned)
+    same_size, same_sizes = _equal_sizes(_size_ratios(sides, len(real.class_names)), size)
+    return Likeness(len(ours), len(theirs), same_size, same_sizes, _traits(sides, None), classes, turned)
+
+
+def _traits(sides: tuple[_Values, _Values], index: int | None) -> tuple[Trait, ...]:
+    """Return the traits that both sides have, of a class by its index, or of all classes."""
+    shown = [key for key in _TRAITS if all(side.get((key, index)) for side in sides)]
+    return tuple(_trait(key, sides[0][key, index], sides[1][key, index]) for key in shown)
+
+
+def _equal_sizes(ratios: Sequence[float], size: int) -> tuple[int | None, tuple[int, int] | None]:
+    """Return the image size [px] at which photographed objects are as large as rendered ones at ``size``.
+
+    The size is that of the median class, followed by the sizes of the extreme classes; None without classes.
+    """
+    if not ratios:
+        return None, None
+    least, middle, most = (max(round(size * ratio / STRIDE), 1) * STRIDE for ratio in np.quantile(ratios, [0, 0.5, 1]))
+    return middle, (least, most)
 
 
 def _zero_hue_sums() -> Float64Array:

@@ -90,6 +90,7 @@ class Shaking:
         bodies: Mask of the bodies on this ground, shape (N,).
         direction: Horizontal unit vector, shape (3,).
         speed: Maximum speed [m/s].
+        duration: Duration of whole periods [s].
     """
 
     bodies: BoolArray

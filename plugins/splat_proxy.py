@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.quality import resolve_quality
@@ -186,7 +187,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         self,
         scene: mi.Scene,
         sensor: mi.Sensor | int = 0,
-        seed: int = 0,
+        seed: mi.UInt32 | int = 0,
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
@@ -199,7 +200,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             kernel = trained_kernel(shape.splats.kernel for shape in scene.shapes() if hasattr(shape, "splats"))
             self.renderer.quality = replace(quality, kernel=kernel)
         try:
-            layers = self.renderer.render_layers(scene, sensor, seed=int(seed))
+            layers = self.renderer.render_layers(scene, sensor, seed=int(mi.UInt32(seed)[0]))
         finally:
             self.renderer.quality = quality  # the next scene may state another kernel
         view = view_of(sensor)
@@ -215,6 +216,13 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             dr.eval(image)
             check_dropped_rays()
         return image
+
+    def sample(self, *_args: object, **_options: object) -> tuple[mi.Color3f, mi.Bool, list[mi.Float]]:
+        """Refuse rays of another integrator, such as `aov`, which nests this one."""
+        raise InputError(
+            "integrator 'splat_proxy': must not be nested in another integrator; its image has depth, ids, normals and "
+            "light as the channels of aov_names()"
+        )
 
     def to_string(self) -> str:
         """Return the description that Mitsuba prints."""

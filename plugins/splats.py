@@ -112,6 +112,8 @@ class SplatsShape(mi.Mesh):
         self, props: mi.Properties, splats: Splats | None = None, proxy: trimesh.Trimesh | None = None
     ) -> None:
         super().__init__("splats", 3, 1, props=props)
+        if self.is_emitter():
+            raise InputError("shape 'splats': must not have an emitter: add it to a mesh")
         # Mitsuba requires a mesh; one triangle without area is never hit.
         params = mi.traverse(self)
         params["vertex_positions"] = mi.Float([0.0] * 9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import reduce
@@ -15,7 +16,8 @@ from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.images.masks import Silhouette
 from mitsplat.quality import Quality
 from mitsplat.renderer.composition.material_borders import FROM_PROXY
-from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneContents, same_shapes
+from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneContents
+from mitsplat.renderer.composition.shape_state import ShapeState
 from mitsplat.renderer.instances.antialiasing import Edges
 from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
 from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes, with_area_beyond
@@ -32,7 +34,7 @@ from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.static_tile_cache import StaticTileCache
 
-_CacheKey = tuple[tuple[object, ...], Quality, list["mi.Shape"]]
+_CacheKey = tuple[tuple[object, ...], Quality, ShapeState]
 """Camera, quality and visible shapes."""
 
 
@@ -273,7 +275,7 @@ class LayerRenderer:
         contents = self._contents.read(scene, self.occluders == "splats")
         view = view_of(sensor)
         proxies: dict[int, list[tuple[trimesh.Trimesh, np.ndarray]]] = {}
-        for shape in contents.shapes:
+        for shape in contents.state.shapes:
             if getattr(shape, "instance", 0) and shape.proxy is not None:
                 proxies.setdefault(shape.instance, []).append((shape.proxy, shape.world_from_splats))
         if source != "splats":
@@ -342,18 +344,18 @@ class LayerRenderer:
             return None
         if not any(contents.clouds.counts[p.cloud] for p in static):
             return None
-        fixed = [s for s in contents.shapes if getattr(s, "instance", 0) == 0]
+        fixed = [s for s in contents.state.shapes if getattr(s, "instance", 0) == 0]
         if not self.hide_emitters:
             fixed += [s for s in scene.shapes() if s.is_emitter()]
-        seen = view.key, self.quality, fixed
-        if self._static_tiles is None or not _same_key(self._static_tiles[0], seen):
-            self._static_tiles = seen, None
+        if self._static_tiles is None or not _is_key_of(self._static_tiles[0], view, self.quality, fixed):
+            self._static_tiles = (view.key, self.quality, ShapeState.of(fixed)), None
         elif self._static_tiles[1] is None:
             with suppress(CrowdedError):
-                self._static_tiles = seen, StaticTileCache.of(contents.clouds, static, view, self.quality, z_max)
+                cache = StaticTileCache.of(contents.clouds, static, view, self.quality, z_max)
+                self._static_tiles = self._static_tiles[0], cache
         return self._static_tiles[1]
 
 
-def _same_key(a: _CacheKey, b: _CacheKey) -> bool:
-    """Return True if two keys of camera, quality and shapes are the same."""
-    return a[:2] == b[:2] and same_shapes(a[2], b[2])
+def _is_key_of(key: _CacheKey, view: CameraView, quality: Quality, shapes: Sequence[mi.Shape]) -> bool:
+    """Return True if a key is that of a camera, a quality and shapes."""
+    return key[:2] == (view.key, quality) and key[2].holds_for(shapes)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
 
+from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.composition.material_borders import MixedObjects
 from mitsplat.renderer.composition.shading_normals import NormalMappedShapes
+from mitsplat.renderer.composition.shape_state import ShapeState
 from mitsplat.renderer.light.light_traits import Traits
 from mitsplat.renderer.materials.radiance_grid import RadianceGrid
 from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
@@ -24,7 +25,7 @@ class SceneContents:
     """Device data of all shapes of a scene that emit no light; reused while these shapes stay the same.
 
     Attributes:
-        shapes: The shapes.
+        state: The shapes with their parameters.
         clouds: Gaussians of the shapes ``splats``; None if there are none.
         placements: Poses and instances of these clouds.
         proxies: Proxy meshes and visible meshes, as surfaces that rays hit.
@@ -36,7 +37,7 @@ class SceneContents:
         normal_mapped: Shapes with normals finer than their proxy meshes; None if there are none.
     """
 
-    shapes: tuple[mi.Shape, ...]
+    state: ShapeState
     clouds: CloudSet | None
     placements: tuple[Placement, ...]
     proxies: Proxies
@@ -64,10 +65,14 @@ class ContentsReader:
         # Emitter shapes change from frame to frame; as contents they are neither visible nor occluders.
         shapes = tuple(s for s in scene.shapes() if not s.is_emitter())
         known = self._contents
-        if known is not None and same_shapes(known.shapes, shapes):
+        if known is not None and known.state.holds_for(shapes):
             return known
         carriers = [s for s in shapes if hasattr(s, "world_from_splats")]
         visible = [s for s in shapes if not hasattr(s, "world_from_splats")]
+        if any(s.class_name() == "Instance" for s in visible):
+            raise InputError(
+                "integrator 'splat_proxy': shapes of type 'instance' are not supported: add the shape at each place"
+            )
         distinct = list({id(c.splats): c.splats for c in carriers}.values())
         number = {id(splats): i for i, splats in enumerate(distinct)}
         placements = tuple(
@@ -82,7 +87,7 @@ class ContentsReader:
         if meshes is not None and meshes.diffuse is not None:
             mirror = SplatMirror.build(clouds, placements, distinct, [c.capture_light == "uniform" for c in carriers])
         self._contents = SceneContents(
-            shapes,
+            ShapeState.of(shapes),
             clouds,
             placements,
             Proxies(occluders, [s for s in visible if not is_transmissive(s.bsdf())], casters),
@@ -121,8 +126,3 @@ def _occluder(shape: mi.Shape) -> Occluder:
     return Occluder(
         shape.proxy, shape.instance, shape.dynamic, shape.world_from_splats, splats, shape.appearance, shape.gloss
     )
-
-
-def same_shapes(some: Sequence[mi.Shape], others: Sequence[mi.Shape]) -> bool:
-    """Return True if both sequences hold the same objects in the same order."""
-    return len(some) == len(others) and all(a is b for a, b in zip(some, others, strict=True))

@@ -75,9 +75,14 @@ def segments(starts: np.ndarray, ends: np.ndarray) -> mi.Ray3f:
 def ray_scene(contents: Mapping[str, mi.Shape], *, watertight: bool = True) -> mi.Scene:
     """Load a Mitsuba scene of ``contents`` (shapes, lights and others) with watertight triangle edges.
 
-    By default Embree misses rays on an edge that two triangles share; OptiX does not.
+    By default Embree misses rays on an edge that two triangles share; OptiX does not. The contents keep the ids that
+    they have in another scene, by which scripts change their parameters.
     """
-    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": watertight, **contents}, parallel=False)
+    ids = [(item, item.id()) for item in contents.values()]
+    scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": watertight, **contents}, parallel=False)
+    for item, name in ids:
+        item.set_id(name)
+    return scene
 
 
 def plain_mesh(mesh: trimesh.Trimesh, properties: mi.Properties | None = None) -> mi.Mesh:

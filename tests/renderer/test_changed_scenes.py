@@ -1,0 +1,119 @@
+"""Scenes whose parameters a Mitsuba script changes between images, and uses of the plugins that are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mitsplat.errors import InputError
+from mitsplat.renderer.layers import make_integrator, make_splats_shape
+from mitsplat.runtime.variant import ensure_variant
+from tests.renderer.test_light import WHITE_SKY, floor, nothing, slab
+
+
+def make_scene() -> Any:
+    """Build a captured floor with an object, a table, a block, and a visible lamp."""
+    ensure_variant()
+    at = mi.ScalarTransform4f()
+    lamp = at.look_at(origin=[0.4, 0.5, 1], target=[0, 0, 0], up=[0, 0, 1]).scale(0.2)
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 50,
+                "to_world": at.look_at(origin=[0, -1.2, 1], target=[0, 0, 0], up=[0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 32, "height": 24},
+            },
+            "floor": make_splats_shape(floor(), proxy=slab()),
+            "part": make_splats_shape(floor(0.1, 0.8, 0.2), proxy=slab(0.1, 0.2), instance=1),
+            "table": {
+                "type": "rectangle",
+                "to_world": at.translate([-0.4, 0, 0.1]).scale(0.2),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.4, 0.2]}},
+            },
+            "block": {"type": "cube", "to_world": at.translate([0.4, 0, 0.1]).scale(0.1)},
+            "lamp": {
+                "type": "rectangle",
+                "to_world": lamp,
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 12.0}},
+            },
+            "sky": WHITE_SKY,
+        }
+    )
+
+
+def moved(value: Any) -> Any:
+    return mi.AffineTransform4f(mi.Transform4f().translate([0.05, -0.1, 0.05])) @ value
+
+
+def shifted(value: Any) -> Any:
+    points = dr.unravel(mi.Point3f, value)
+    points.y -= 0.2
+    return dr.ravel(points)
+
+
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("table.to_world", moved),
+        ("table.bsdf.reflectance.value", lambda colour: colour * 0.3),
+        ("block.vertex_positions", shifted),
+        ("lamp.to_world", moved),
+        ("sensor.to_world", moved),
+    ],
+)
+def test_a_changed_parameter_changes_the_image_as_in_a_new_integrator(key: str, change: Callable[[Any], Any]) -> None:
+    """The data of the shapes, and the tiles of the captured floor, are reused only while their parameters stay."""
+    scene, integrator = make_scene(), make_integrator(shadow_samples=16, shadow_error=0)
+
+    def render(renderer: Any) -> np.ndarray:
+        return np.array(renderer.render(scene, seed=3))
+
+    before = [render(integrator) for _ in range(3)][-1]
+    parameters = mi.traverse(scene)
+    old = type(parameters[key])(parameters[key])
+    parameters[key] = change(old)
+    parameters.update()
+    after = render(integrator)
+    assert np.abs(after - before).max() > 0.05
+    np.testing.assert_allclose(after, render(make_integrator(shadow_samples=16, shadow_error=0)), atol=1e-5)
+    parameters[key] = old
+    parameters.update()
+    np.testing.assert_allclose(render(integrator), before, atol=1e-5)
+
+
+def test_the_seed_may_be_a_device_value() -> None:
+    """Mitsuba's interface states `mi.UInt32`."""
+    scene, integrator = make_scene(), make_integrator(shadow_samples=4)
+    assert dr.all(integrator.render(scene, seed=mi.UInt32(5)) == integrator.render(scene, seed=5), axis=None)
+
+
+def test_an_integrator_around_the_plugin_is_refused_in_one_sentence() -> None:
+    scene = make_scene()
+    around = mi.load_dict({"type": "aov", "aovs": "d:depth", "splats": make_integrator(shadow_samples=4)})
+    with pytest.raises(InputError, match=r"^integrator 'splat_proxy': must not be nested in another integrator"):
+        around.render(scene, spp=1)
+
+
+def test_instanced_shapes_are_refused_in_one_sentence() -> None:
+    ensure_variant()
+    group = {"type": "shapegroup", "cube": {"type": "cube"}}
+    scene = {"type": "scene", "group": group, "one": {"type": "instance", "group": {"type": "ref", "id": "group"}}}
+    sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+    loaded = mi.load_dict(scene | {"sensor": sensor, "part": make_splats_shape(floor())})
+    with pytest.raises(InputError, match=r"^integrator 'splat_proxy': shapes of type 'instance' are not supported"):
+        make_integrator().render(loaded)
+
+
+def test_splats_with_an_emitter_are_refused() -> None:
+    """They would be treated as a lamp and not be visible."""
+    ensure_variant()
+    emitter = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": 1.0}})
+    with pytest.raises(InputError, match=r"^shape 'splats': must not have an emitter"):
+        make_splats_shape(nothing(), emitter=emitter)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 import trimesh
 
 from mitsplat.gaussians.spherical_harmonics import SH_C0
@@ -120,3 +121,28 @@ def test_many_rays_hit_the_same_triangles_as_few() -> None:
     assert "_open_edged" in vars(surface)
     assert np.array_equal(np.array(many.prim_index), np.array(few.prim_index))
     assert np.allclose(np.array(many.t), np.array(few.t), rtol=1e-5)
+
+
+@pytest.mark.parametrize("in_loop", [False, True])
+def test_many_shadow_rays_are_occluded_as_few_are(in_loop: bool) -> None:
+    """Many shadow rays are traced in the second scene, also in loops; the sphere occludes those that cross it."""
+    make_integrator()
+    sphere = trimesh.creation.icosphere(2)
+    surface = Proxies([Occluder(sphere, 1, dynamic=True)]).dynamic
+    assert surface is not None
+    count = 4 * len(sphere.faces)
+    towards = np.random.default_rng(0).normal(size=(3, count)).astype(np.float32)
+    ray = mi.Ray3f(mi.Point3f(0), dr.normalize(mi.Vector3f(towards)))
+    ray.maxt = dr.select(dr.arange(mi.UInt32, count) % 2 == 0, mi.Float(0.9), 1.1)  # facets are 0.98 to 1 away
+    dr.eval(ray)
+
+    def occluded() -> mi.Bool:
+        return surface.occluded(ray, mi.UInt32(0), mi.UInt32(0), mi.Bool(True), watertight=False)
+
+    if in_loop:
+        state = dr.zeros(mi.UInt32, count), dr.zeros(mi.Bool, count)
+        _, found = dr.while_loop(state, lambda i, _: i < 1, lambda i, _: (i + 1, occluded()), label="rays")
+    else:
+        found = occluded()
+    assert "_open_edged" in vars(surface)
+    assert np.array_equal(np.array(found), np.arange(count) % 2 == 1)

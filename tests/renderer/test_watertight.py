@@ -87,20 +87,26 @@ def test_every_pixel_of_a_table_seen_from_above_is_lit(up: tuple[float, float, f
     assert layers.light.min() > 0.9
 
 
+@pytest.mark.parametrize("lamp", ["point", "square"])
 @pytest.mark.parametrize("kind", ["visible", "static", "dynamic"])
-def test_no_light_passes_through_a_plate(kind: str) -> None:
+def test_no_light_passes_through_a_plate(kind: str, lamp: str) -> None:
     """Pixels lie on the plate's diagonals: rays from the floor to a lamp hit the plate's edges."""
     ensure_variant()
     mesh = PLATE.copy().apply_translation((0, 0, 0.5))
     instance = 1 if kind == "dynamic" else 0
     plate = plain_mesh(mesh) if kind == "visible" else make_splats_shape(NO_SPLATS, proxy=mesh, instance=instance)
-    lamp = {"type": "point", "position": [0, 0, 1], "intensity": {"type": "rgb", "value": 1.0}}
+    bright = {"type": "rgb", "value": 1.0}
+    emitter = {"type": "point", "position": [0, 0, 1], "intensity": bright}
+    if lamp == "square":
+        place = mi.ScalarTransform4f().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(0.02)
+        emitter = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": bright}}
+    rays = 1 if lamp == "point" else 16
     for width, height in [(96, 96), (65, 65), (128, 72)]:
         camera = Camera.look_at((0, 0, 0.4), (0, 0, 0), up=(0, 1, 0), width=width, height=height, fov_x=48)
-        scene = {"floor": plain_mesh(SOLIDS["table"]), "plate": plate, "lamp": lamp}
-        assert render(camera, scene, shadow_error=0.0, shadow_samples=1).light.max() == 0
+        scene = {"floor": plain_mesh(SOLIDS["table"]), "plate": plate, "lamp": emitter}
+        assert render(camera, scene, shadow_error=0.0, shadow_samples=rays).light.max() == 0
     scene.pop("plate")
-    assert render(camera, scene, shadow_error=0.0, shadow_samples=1).light.min() > 0
+    assert render(camera, scene, shadow_error=0.0, shadow_samples=rays).light.min() > 0
 
 
 def test_the_silhouette_of_a_plate_has_no_holes() -> None:

@@ -72,6 +72,8 @@ class Emitters:
         even_sky: True if the sky has one colour.
         sky_colour: This colour; None for another sky.
         infinite: 1 for emitters at infinite distance, else 0.
+        any_without_extent: True if an emitter is a point or has one direction. All of its rays through regular points
+            can hit edges of a proxy.
         choice: Probabilities of the emitters in :meth:`sample`.
         local_choice: The same without the sky; None if there is no other emitter.
         rectangles: Area lights in closed form; None unless all emitters besides the sky are rectangles.
@@ -101,6 +103,7 @@ class Emitters:
         local = np.where(np.arange(len(emitters)) == sky, 0, share)
         self.local_choice = _DiscreteDistribution(local) if len(emitters) > len(skies) else None
         self.rectangles = Rectangles.of(emitters, sky)
+        self.any_without_extent = any(mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in emitters)
         infinite = [mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters]
         self.infinite = mi.UInt32([int(v) for v in infinite])
         self.sky_colour = None

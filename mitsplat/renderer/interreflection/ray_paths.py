@@ -56,7 +56,7 @@ def occluded(
     """Return True for rays that any of some scenes occludes."""
     free = active
     for occluder_scene in occluder_scenes:
-        free = free & ~occluder_scene.occluded(ray, instance, key, free)
+        free = free & ~occluder_scene.occluded(ray, instance, key, free, watertight=False)
         end_kernel(proxies, free)
     return active & ~free
 

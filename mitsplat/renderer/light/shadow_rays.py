@@ -72,7 +72,7 @@ class ShadowTracer:
         would be missed in all of them. The light without dynamic objects is only a divisor, for which a quarter of the
         rays is sufficient. The other rays test static occluders only if a dynamic object occludes them as well.
         """
-        proxies, width = self.proxies, self.view.width
+        proxies, width, watertight = self.proxies, self.view.width, self.emitters.any_without_extent
         pixel, inside = block_order(self.view)
         origin, normal, offset, instance = _packed_rays(self.surface, captured, pixel)
         x, y = pixel % width, pixel // width
@@ -83,12 +83,13 @@ class ShadowTracer:
         active &= dr.sum(beam.irradiance) > 0
         blocked, counts, share = mi.Bool(False), active, 1
         for occluder_scene in proxies.shadow_casters:
-            blocked |= occluder_scene.occluded(ray, instance, key, active & ~blocked)
+            blocked |= occluder_scene.occluded(ray, instance, key, active & ~blocked, watertight=watertight)
             if proxies.separate_kernels:
                 dr.eval(blocked)
         if proxies.static is not None:
             one_of_four = ((x | y) & 1) == 0
-            stopped = proxies.static.occluded(ray, instance, key, active & (blocked | one_of_four))
+            tested = active & (blocked | one_of_four)
+            stopped = proxies.static.occluded(ray, instance, key, tested, watertight=watertight)
             blocked &= ~stopped
             counts, share = active & one_of_four & ~stopped, 4
         arriving = dr.select(counts, beam.irradiance * share, 0)
@@ -184,7 +185,8 @@ class _RayBatch:
     def occluded(self, occluder_scene: OccluderScene, beam: Beam, number: mi.UInt32, active: mi.Bool) -> mi.Bool:
         """Return True for rays that a scene occludes."""
         ray = _shadow_ray(self.origin, beam, self.surface.offset)
-        return occluder_scene.occluded(ray, self.surface.instance, self.pixel * RECURRENCE[0] + number, active)
+        key, watertight = self.pixel * RECURRENCE[0] + number, self.tracer.emitters.any_without_extent
+        return occluder_scene.occluded(ray, self.surface.instance, key, active, watertight=watertight)
 
     def occlusion_bits(self, occluder_scene: OccluderScene, rays: mi.UInt32, known: Sequence[mi.UInt32]) -> mi.UInt32:
         """Return the rays that a scene occludes and the scenes of ``known`` do not, as bits of an integer per point."""

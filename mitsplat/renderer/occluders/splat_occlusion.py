@@ -178,7 +178,9 @@ class SplatOccluders:
         np.maximum.at(skip_distance, [c.instance for c in casters], solids.footprints.astype(np.float32))
         return cls(solids, wrapped(mi.Float, skip_distance))
 
-    def occluded(self, ray: mi.Ray3f, instance: mi.UInt32, key: mi.UInt32, active: mi.Bool) -> mi.Bool:
+    def occluded(
+        self, ray: mi.Ray3f, instance: mi.UInt32, key: mi.UInt32, active: mi.Bool, *, watertight: bool = True
+    ) -> mi.Bool:
         """Return True for occluded rays from points of instances; ``key`` selects the random outcome of a ray."""
         instance = mi.UInt32(instance)
         near = dr.gather(mi.Float, self.skip_distance, instance, active & (instance < dr.width(self.skip_distance)))

@@ -78,7 +78,7 @@ def ray_scene(contents: Mapping[str, mi.Shape], *, watertight: bool = True) -> m
     By default Embree misses rays on an edge that two triangles share; OptiX does not. The contents keep the ids that
     they have in another scene, by which scripts change their parameters.
     """
-    ids = [(item, item.id()) for item in contents.values()]
+    ids = [(item, item.id()) for item in contents.values() if isinstance(item, mi.Object)]
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": watertight, **contents}, parallel=False)
     for item, name in ids:
         item.set_id(name)

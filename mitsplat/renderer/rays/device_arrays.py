@@ -75,10 +75,10 @@ def segments(starts: np.ndarray, ends: np.ndarray) -> mi.Ray3f:
 def ray_scene(contents: Mapping[str, mi.Shape], *, watertight: bool = True) -> mi.Scene:
     """Load a Mitsuba scene of ``contents`` (shapes, lights and others) with watertight triangle edges.
 
-    By default Embree misses rays on an edge that two triangles share; OptiX does not. The contents keep the ids that
-    they have in another scene, by which scripts change their parameters.
+    By default Embree misses rays on an edge that two triangles share; OptiX does not. Contents with an id keep it,
+    because scripts change their parameters by it. Others get their key as id.
     """
-    ids = [(item, item.id()) for item in contents.values() if isinstance(item, mi.Object)]
+    ids = [(item, item.id()) for item in contents.values() if isinstance(item, mi.Object) and item.id()]
     scene = mi.load_dict({"type": "scene", "embree_use_robust_intersections": watertight, **contents}, parallel=False)
     for item, name in ids:
         item.set_id(name)

@@ -17,7 +17,7 @@ from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
-from mitsplat.renderer.light.light_points import OFFSETS
+from mitsplat.renderer.light.light_points import POINT_STEP
 from mitsplat.renderer.light.light_tiles import BLOCK
 from mitsplat.renderer.light.shadow_rays import RECURRENCE, SURROUNDINGS_RECURRENCE, _bayer
 from mitsplat.renderer.occluders.proxies import Proxies, smooth_normals
@@ -521,7 +521,7 @@ def test_kernels_that_trace_one_scene_give_the_same_light(
         assert getattr(one_by_one, name).tobytes() == getattr(together, name).tobytes(), name
 
 
-@pytest.mark.parametrize(("stride", "apart"), [(1, 0.18), (BLOCK * BLOCK, 0.24), (len(OFFSETS) * BLOCK * BLOCK, 0.06)])
+@pytest.mark.parametrize(("stride", "apart"), [(1, 0.18), (BLOCK * BLOCK, 0.24), (POINT_STEP * BLOCK * BLOCK, 0.11)])
 def test_sample_points_of_rays_do_not_repeat(stride: int, apart: float) -> None:
     """Sample points of neighbours, of one pixel, and of each point of a curved pixel differ.
 

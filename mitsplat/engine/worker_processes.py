@@ -40,8 +40,8 @@ _POLL_INTERVAL = 1.0
 _MAX_ARGUMENTS = 1 << 14
 """Maximum length of a command line that is part of a worker's start data [bytes]."""
 
-_NO_GUARD = 'does the script start workers outside of `if __name__ == "__main__":`?'
-"""Possible cause of workers that end before their start: each of them runs the script again."""
+_CAUSES_AT_START = 'out of memory, or does the script start workers outside of `if __name__ == "__main__":`?'
+"""Possible causes of workers that end before their start; without the guard, each of them runs the script again."""
 
 _END_TIMEOUT = 30.0
 """Time limit for the end of a worker that has closed its pipe [s]."""
@@ -162,7 +162,7 @@ class WorkerProcesses(Generic[Result]):
             except (EOFError, OSError):
                 lost = Lost(_describe_end(process))
                 if worker in self._starting and (process.exitcode or 0) > 0:
-                    lost = Lost(f"{lost.how} before its start", _NO_GUARD)
+                    lost = Lost(f"{lost.how} before its start", _CAUSES_AT_START)
                 self.stop(worker)
                 yield worker, lost
                 continue

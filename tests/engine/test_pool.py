@@ -167,14 +167,14 @@ def test_a_worker_that_does_not_start_in_time_is_reported(monkeypatch, interpret
     interpreter(script)
     begun, notes = time.monotonic(), []
     large = Make(how="x" * 10_000_000)
-    with pytest.raises(LostWorkersError, match=rf"the worker of frame [01] {words}, 3 times"):
+    with pytest.raises(LostWorkersError, match=rf"the worker of frame [01] {words}, 3 times in a row \(out of memory"):
         run(large, 2, {0: [0], 1: [1]}, notes.append)
     assert time.monotonic() - begun < 20
     assert re.fullmatch(rf"the worker of frame [01] {re.escape(words)}: the frame is repeated", notes[0])
 
 
 def test_a_script_without_a_guarded_main_part_is_named(tmp_path):
-    """Its workers run the script again and fail, which is no lack of memory."""
+    """Its workers run the script again and fail, which looks like a lack of memory."""
     script = tmp_path / "script.py"
     script.write_text("from tests.engine.test_pool import Make, run\nrun(Make(), 2)\n")
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}

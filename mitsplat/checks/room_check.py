@@ -41,23 +41,35 @@ def check_room(scene: Scene, *, draw: bool) -> Finding:
 
 
 def _first_crowded_layout(scene: Scene) -> str:
-    """Return a text about the first layout whose objects find no room in its first draw, or empty."""
+    """Return a text about the first layout whose objects find no room, if such layouts would end a run; else empty.
+
+    They do if their share exceeds ``settle.incomplete``, or if one of them has no room for half of its objects.
+    """
     with warp_settings():
         from mitsplat.physics.drop import drop_of  # Newton reads these settings when it compiles
 
-        drop = drop_of(scene, discard_note)
-        for layout in range(min(scene.spec.output.layouts, MAX_LAYOUTS)):
-            number = drop.static_key(layout)
-            regions = _crowded_regions(scene, layout, drop.start_poses, drop.static_scenes[number])
-            if regions:
-                return f"layout {layout} has no room for all objects at the start: {'; '.join(regions)}"
+        drop, first, crowded = drop_of(scene, discard_note), "", 0
+        layouts = min(scene.spec.output.layouts, MAX_LAYOUTS)
+        for layout in range(layouts):
+            number = drop.static_key(layout)  # may replace the static scenes
+            regions, half_fits = _crowded_regions(scene, layout, drop.start_poses, drop.static_scenes[number])
+            if not regions:
+                continue
+            crowded += 1
+            text = f"layout {layout} has no room for all objects at the start: {'; '.join(regions)}"
+            first = first or text
+            if not half_fits:
+                return text
+            if crowded > scene.spec.settle.incomplete * layouts:
+                return first
     return ""
 
 
-def _crowded_regions(scene: Scene, layout: int, start_poses: StartPoses, static: StaticScene) -> list[str]:
+def _crowded_regions(scene: Scene, layout: int, start_poses: StartPoses, static: StaticScene) -> tuple[list[str], bool]:
     """Describe the regions that are too small for the objects of a layout; [] if all objects find room.
 
-    These are all regions of its objects if each of them has room without the others.
+    These are all regions of its objects if each of them has room without the others. The second value is True if half
+    of the objects find room.
     """
     spec = scene.spec
     arrangements = draw_arrangements(spec, layout)
@@ -68,10 +80,11 @@ def _crowded_regions(scene: Scene, layout: int, start_poses: StartPoses, static:
 
     items = start_poses.items(*draw_objects(scene, layout), draw_regions(spec, layout))
     if has_room(items):
-        return []
+        return [], True
     contents = {region: [item for item in items if item.region == region] for region in {item.region for item in items}}
     crowded = [region for region, some in contents.items() if len(contents) > 1 and not has_room(some)]
-    return [
+    texts = [
         f"{len(contents[region])} objects in {spec.region_names[region]}, {arrangements[region]}"
         for region in crowded or contents
     ]
+    return texts, has_room(items[: -(-len(items) // 2)])

@@ -150,6 +150,15 @@ NARROW = {"min": [-0.2, -0.02, 0.02], "max": [0.2, 0.02, 0.3]}
         # A row of 0.4 m has no room for 20 nuts of at least 20 mm at distances of at least 2 mm.
         ({"region": NARROW, "settle": {"arrangement": "packed"}}, "20 objects in main, packed"),
         ({"region": NARROW, "settle": {"arrangement": "pile"}}, ""),
+        ({"region": NARROW, "settle": {"arrangement": "packed", "incomplete": 1}}, ""),  # the run leaves some out
+        (  # it never leaves out more than half
+            {
+                "region": NARROW,
+                "settle": {"arrangement": "packed", "incomplete": 1},
+                "objects": [{"asset": "assets/nut", "count": 40}],
+            },
+            "40 objects in main, packed",
+        ),
         (
             {
                 "regions": [{"name": "shelf", **NARROW, "arrangement": "packed"}],

@@ -32,9 +32,10 @@ POINT_START, POINT_STEP = 50, 3
 
 With point k taking every fourth number from k on, all rays of a point would sample almost the same part of the lamps:
 the first coordinate of the shadow rays' sequence changes by 0.02 in four numbers. A thread below a lamp then shows
-white and black points by chance. Of the steps below 64 whose points do not repeat within 1024 rays, these are nearly
-the best: the distance between 2, 4 and 8 rays of a point, and between the rays of all points, is at least 0.39 of the
-largest possible distance, for shadow rays and reflection rays.
+white and black points by chance. With these steps, the distance between 2, 4 and 8 rays of a point, and between the
+rays of all points, is at least 0.39 of the largest possible distance, for shadow rays and reflection rays; no steps
+below 64 reach more than 0.46. The first and the last point share ray numbers from the 51st ray of a point on, that is
+above 200 rays of a pixel, which did not increase the error of 512 to 2048 rays.
 """
 
 Sums = TypeVar("Sums", Estimate, Reflections)

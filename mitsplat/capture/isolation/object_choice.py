@@ -99,7 +99,8 @@ def choose_object(
         box: Minimum and maximum x, y and z of a box that contains the object.
 
     Raises:
-        InputError: If there is no object above the support, or a pick is near no point of an object.
+        InputError: If there is no object above the support, if a pick is near no point of an object, or if the picks
+            of other objects exclude it.
     """
     focus, distance = focus_of([view.camera for view in views])
     if box is not None:
@@ -119,7 +120,7 @@ def choose_object(
     gap = gap_between(points[stands], *(bound * distance for bound in _GAP_BOUNDS))
     cluster = np.full(len(points), -1, dtype=np.int64)
     cluster[stands] = cluster_points(points[stands], gap)
-    refused = {_picked_cluster(pick, points, cluster) for pick in picks_not}
+    refused = {_picked_cluster(pick, points, cluster): pick.name for pick in picks_not}
     if picks:
         chosen = {_picked_cluster(pick, points, cluster) for pick in picks}
     else:
@@ -127,11 +128,12 @@ def choose_object(
         scores = np.bincount(cluster[stands], _centrality(points, views)[stands] * np.exp(-0.5 * away**2))
         scores[list(refused)] = -1
         chosen = {int(scores.argmax())}
-    if refused >= chosen:
-        raise InputError(
-            f"an object is selected by both --pick and --pick-not ({picks_not[0].name}): the picked objects touch"
-        )
-    own = np.isin(cluster, sorted(chosen - refused))
+    if chosen <= refused.keys():
+        names = ", ".join(refused[number] for number in sorted(chosen if picks else refused))
+        if picks:
+            raise InputError(f"an object is selected by both --pick and --pick-not ({names}): the picked objects touch")
+        raise InputError(f"no object remains: --pick-not ({names}) excludes all of them")
+    own = np.isin(cluster, sorted(chosen - refused.keys()))
     feet = _project_feet(points[own], height[own], support)
     large = np.flatnonzero(np.bincount(cluster[stands]) >= _MIN_POINTS)
     others = tuple(points[cluster == number] for number in large if not own[cluster == number].any())

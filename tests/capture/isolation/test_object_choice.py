@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -73,6 +75,11 @@ def test_hints_without_a_matching_object_are_refused(place: tuple[Float64Array, 
     one = pick(place, 1)
     with pytest.raises(InputError, match=r"selected by both --pick and --pick-not \(one.jpg:1,2\)"):
         choose_object(points, views, picks=[one], picks_not=[one])
+    with pytest.raises(InputError, match=r"selected by both --pick and --pick-not \(one.jpg:1,2\)"):
+        choose_object(points, views, picks=[one], picks_not=[replace(pick(place, 2), name="two.jpg:1,2"), one])
+    only = (0.1, -0.05, -0.02, 0.25, 0.1, 0.15)
+    with pytest.raises(InputError, match=r"^no object remains: --pick-not \(one.jpg:1,2\) excludes all"):
+        choose_object(points, views, picks_not=[pick(place, 2)], box=only)
     with pytest.raises(InputError, match="no point of an object within 32 px"):
         choose_object(points, views, picks=[Pick("one.jpg:0,0", views[0], (0.0, 0.0))])
     bare = np.flatnonzero(labels == 0)

@@ -200,7 +200,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             kernel = trained_kernel(shape.splats.kernel for shape in scene.shapes() if hasattr(shape, "splats"))
             self.renderer.quality = replace(quality, kernel=kernel)
         try:
-            layers = self.renderer.render_layers(scene, sensor, seed=int(mi.UInt32(seed)[0]))
+            number = int(seed if isinstance(seed, int | np.integer) else seed[0])
+            layers = self.renderer.render_layers(scene, sensor, seed=number)
         finally:
             self.renderer.quality = quality  # the next scene may state another kernel
         view = view_of(sensor)

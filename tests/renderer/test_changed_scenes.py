@@ -94,6 +94,12 @@ def test_the_seed_may_be_a_device_value() -> None:
     assert dr.all(integrator.render(scene, seed=mi.UInt32(5)) == integrator.render(scene, seed=5), axis=None)
 
 
+@pytest.mark.parametrize("seed", [-1, 2**32 - 1, 2**40])
+def test_the_seed_may_be_any_number(seed: int) -> None:
+    scene, integrator = make_scene(), make_integrator(shadow_samples=4)
+    assert dr.all(integrator.render(scene, seed=seed) == integrator.render(scene, seed=seed % 2**32), axis=None)
+
+
 def test_an_integrator_around_the_plugin_is_refused_in_one_sentence() -> None:
     scene = make_scene()
     around = mi.load_dict({"type": "aov", "aovs": "d:depth", "splats": make_integrator(shadow_samples=4)})

@@ -104,7 +104,7 @@ def _head(lines: list[str], node: ast.ClassDef | ast.FunctionDef) -> str:
     indent = " " * node.col_offset
     names = [ast.unparse(decorator) for decorator in node.decorator_list]
     decorators = [f"{indent}@{name}" for name in names if re.match(r"dataclass|\w*property|(class|static)method", name)]
-    summary = (ast.get_docstring(node) or "").partition("\n\n")[0]
+    summary = to_markdown((ast.get_docstring(node) or "").partition("\n\n")[0])
     body = textwrap.indent(f'"""{summary}"""' if summary else "...", f"{indent}    ")
     return "\n".join([*decorators, *lines[node.lineno - 1 : node.body[0].lineno - 1], body])
 

@@ -251,8 +251,9 @@ def _slug(title: str) -> str:
 
 
 def to_markdown(text: str) -> str:
-    """Convert the reStructuredText of a docstring to Markdown."""
-    return re.sub(r":\w+:`~?\.?([^`]+)`", r"`\1`", text).replace("``", "`")
+    """Convert the reStructuredText of a docstring to Markdown; references with ``~`` keep only their last name."""
+    text = re.sub(r":\w+:`~[^`]*?(\w+)`", r"`\1`", text)
+    return re.sub(r":\w+:`\.?([^`]+)`", r"`\1`", text).replace("``", "`")
 
 
 def in_a_row(text: str) -> str:

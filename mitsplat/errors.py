@@ -8,6 +8,9 @@ import re
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of the operating system that mean that there is no space for a file."""
 
+INTERRUPTED = 130
+"""Exit status of an interrupted command."""
+
 _OUT_OF_MEMORY = re.compile("out[ _]of[ _]memory|can.t allocate memory|insufficient memory", re.IGNORECASE)
 
 
@@ -63,7 +66,7 @@ def exit_status(error: BaseException) -> int | None:
     if isinstance(error, PartialResultError):
         return 4
     if _is_interrupt(error):
-        return 130
+        return INTERRUPTED
     return 2 if isinstance(error, InputError | OSError) else None
 
 

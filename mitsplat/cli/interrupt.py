@@ -7,8 +7,7 @@ import signal
 import threading
 from types import FrameType
 
-STATUS = 130
-"""Exit status of an interrupted command."""
+from mitsplat.errors import INTERRUPTED
 
 
 def handle_interrupts() -> None:
@@ -26,6 +25,6 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     caller = frame
     while caller is not None:
         if caller.f_code.co_filename.startswith("<frozen importlib"):
-            os._exit(STATUS)
+            os._exit(INTERRUPTED)
         caller = caller.f_back
     signal.default_int_handler(number, frame)

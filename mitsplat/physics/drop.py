@@ -330,7 +330,8 @@ class Drop:
         """Simulate a draw of a layout from its start poses (N, 4, 4); ``rng`` draws those of objects that fail."""
         settle = self.scene.spec.settle
         fastest = _POUR_SPEED if any(one.arrangement == "pile" for one in drawn) else np.inf
-        static, arrangements = self.static_scenes[self.static_key(index)], self._arrangements(drawn)
+        number, arrangements = self.static_key(index), self._arrangements(drawn)
+        static = self.static_scenes[number]  # static_key may replace the static scenes
         free = np.array([one.given is None for one in drawn])
         own = np.array([one.region for one in drawn])
 

@@ -47,6 +47,7 @@ def test_ctrl_c_outside_of_imports_raises(tmp_path: Path) -> None:
     code = (
         "import os, signal\n"
         "from mitsplat.cli.interrupt import handle_interrupts\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # which a background job does not inherit\n"
         "handle_interrupts()\n"
         "try:\n    os.kill(os.getpid(), signal.SIGINT)\n"
         "except KeyboardInterrupt:\n    print('raised')\n"

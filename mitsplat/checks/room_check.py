@@ -51,8 +51,8 @@ def _first_crowded_layout(scene: Scene) -> str:
         drop, first, crowded = drop_of(scene, discard_note), "", 0
         layouts = min(scene.spec.output.layouts, MAX_LAYOUTS)
         for layout in range(layouts):
-            number = drop.static_key(layout)  # may replace the static scenes
-            regions, half_fits = _crowded_regions(scene, layout, drop.start_poses, drop.static_scenes[number])
+            static = drop.static_scenes[drop.static_key(layout)]
+            regions, half_fits = _crowded_regions(scene, layout, drop.start_poses, static)
             if not regions:
                 continue
             crowded += 1

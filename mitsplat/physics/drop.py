@@ -313,8 +313,9 @@ class Drop:
             return number
         key = len(self._surroundings) + layout
         if key not in self.static_scenes:
-            around = self._surroundings[number]
-            self.static_scenes = {key: make_static_scene(self.scene, self.objects, around, discard_note, layout)}
+            static = make_static_scene(self.scene, self.objects, self._surroundings[number], discard_note, layout)
+            self.static_scenes.clear()
+            self.static_scenes[key] = static
         return key
 
     def _run(
@@ -330,8 +331,7 @@ class Drop:
         """Simulate a draw of a layout from its start poses (N, 4, 4); ``rng`` draws those of objects that fail."""
         settle = self.scene.spec.settle
         fastest = _POUR_SPEED if any(one.arrangement == "pile" for one in drawn) else np.inf
-        number, arrangements = self.static_key(index), self._arrangements(drawn)
-        static = self.static_scenes[number]  # static_key may replace the static scenes
+        static, arrangements = self.static_scenes[self.static_key(index)], self._arrangements(drawn)
         free = np.array([one.given is None for one in drawn])
         own = np.array([one.region for one in drawn])
 

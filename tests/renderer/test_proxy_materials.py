@@ -15,7 +15,7 @@ from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.composition.scene_contents import ContentsReader
 from mitsplat.renderer.layers import make_integrator, make_splats_shape
 from mitsplat.renderer.materials.proxy_materials import corner_materials
-from mitsplat.renderer.occluders.proxies import Occluder, Proxies
+from mitsplat.renderer.occluders.proxies import Occluder, Proxies, TraceScene
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 
 BOX = trimesh.creation.box(extents=(1, 1, 1))
@@ -107,8 +107,8 @@ def test_surfaces_without_splats_reflect_nothing() -> None:
     assert np.array(surface.colour).max() == 0
 
 
-def test_many_rays_hit_the_same_triangles_as_few() -> None:
-    """Reflected light is traced in a second scene if there are many rays, with the same hits inside of triangles."""
+def many_rays_in_sphere() -> tuple[TraceScene, mi.Ray3f, int]:
+    """Return a sphere, four rays per triangle from its centre, and their number."""
     make_integrator()
     sphere = trimesh.creation.icosphere(2)
     surface = Proxies([Occluder(sphere, 1, dynamic=True)]).dynamic
@@ -117,6 +117,12 @@ def test_many_rays_hit_the_same_triangles_as_few() -> None:
     towards = np.random.default_rng(0).normal(size=(3, count)).astype(np.float32)
     ray = mi.Ray3f(mi.Point3f(0), dr.normalize(mi.Vector3f(towards)))
     dr.eval(ray)
+    return surface, ray, count
+
+
+def test_many_rays_hit_the_same_triangles_as_few() -> None:
+    """Reflected light is traced in a second scene if there are many rays, with the same hits inside of triangles."""
+    surface, ray, _ = many_rays_in_sphere()
     many, few = surface.intersect(ray), surface.scene.ray_intersect_preliminary(ray)
     assert "_open_edged" in vars(surface)
     assert np.array_equal(np.array(many.prim_index), np.array(few.prim_index))
@@ -126,13 +132,7 @@ def test_many_rays_hit_the_same_triangles_as_few() -> None:
 @pytest.mark.parametrize("in_loop", [False, True])
 def test_many_shadow_rays_are_occluded_as_few_are(in_loop: bool) -> None:
     """Many shadow rays are traced in the second scene, also in loops; the sphere occludes those that cross it."""
-    make_integrator()
-    sphere = trimesh.creation.icosphere(2)
-    surface = Proxies([Occluder(sphere, 1, dynamic=True)]).dynamic
-    assert surface is not None
-    count = 4 * len(sphere.faces)
-    towards = np.random.default_rng(0).normal(size=(3, count)).astype(np.float32)
-    ray = mi.Ray3f(mi.Point3f(0), dr.normalize(mi.Vector3f(towards)))
+    surface, ray, count = many_rays_in_sphere()
     ray.maxt = dr.select(dr.arange(mi.UInt32, count) % 2 == 0, mi.Float(0.9), 1.1)  # facets are 0.98 to 1 away
     dr.eval(ray)
 

@@ -23,6 +23,7 @@ from typer.core import TyperGroup
 
 from mitsplat.cli import assets, datasets, detectors, fault, inspection, lights, machine, photographs
 from mitsplat.cli.interrupt import handle_interrupts
+from mitsplat.cli.options import parse_strictly
 from mitsplat.errors import LateDeviceError, exit_status, sentence_of
 from mitsplat.runtime.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.storage.file_kinds import check_path_encoding
@@ -99,6 +100,7 @@ app = typer.Typer(
 
 for _functions in COMMAND_GROUPS.values():
     for _function in _functions:
+        parse_strictly(_function)
         app.command(_command_name(_function))(_function)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mitsplat.cli.options import check_ending
+from mitsplat.cli.options import check_ending, parse_number
 from mitsplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def _parse_times(text: str) -> tuple[float, ...]:
     for part in text.split(","):
         numerator, slash, denominator = part.partition("/")
         try:
-            times.append(float(numerator) / (float(denominator) if slash else 1.0))
-        except (ValueError, ZeroDivisionError):
+            times.append(parse_number(numerator) / (parse_number(denominator) if slash else 1.0))
+        except (typer.BadParameter, ZeroDivisionError):
             raise InputError(f"--exposures must be times such as 1/60,1/8,1 (got {text})") from None
     return tuple(times)

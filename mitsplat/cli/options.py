@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar, get_args, get_type_hints
 
 import typer
 
@@ -12,6 +14,7 @@ from mitsplat.arguments import list_in_words
 from mitsplat.errors import InputError
 from mitsplat.quality import PresetName
 
+_Number = TypeVar("_Number", int, float)
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.yaml).")]
 DatasetFolder = Annotated[Path, typer.Argument(metavar="DATASET", help="Dataset folder.")]
 FrameIndex = Annotated[int, typer.Option("--frame", help="Frame index, from 0.")]
@@ -56,6 +59,62 @@ JsonLog = Annotated[
     bool,
     typer.Option("--json", help="Write the progress to stderr as one JSON object per line, instead of a progress bar."),
 ]
+
+
+def parse_strictly(command: Callable[..., None]) -> None:
+    """Let the number options of a command be parsed by :func:`parse_whole_number` and :func:`parse_number`.
+
+    Typer parses them with pydantic otherwise, which reads 0-31 as -31.
+    """
+    command.__annotations__ = get_type_hints(command, include_extras=True)
+    for hint in command.__annotations__.values():
+        for option in getattr(hint, "__metadata__", ()):
+            kinds = _scalar_types(get_args(hint)[0]) - {type(None)}
+            if kinds == {int}:
+                option.parser = parse_whole_number
+            elif kinds == {float}:
+                option.parser = parse_number
+
+
+def _scalar_types(hint: object) -> set[object]:
+    """Return the types in an annotation of an optional value, a list or a tuple."""
+    members = get_args(hint)
+    return {kind for member in members for kind in _scalar_types(member)} if members else {hint}
+
+
+def parse_whole_number(text: str | int) -> int:
+    """Return the number of a text of digits; the default of an option is a number already.
+
+    Raises:
+        BadParameter: If the text is no whole number.
+    """
+    is_range = isinstance(text, str) and re.fullmatch(r"\d+(-|:|,|\.\.)\d*", text)
+    return _parse_as(int, text, f"a whole number, such as 32{', not a range' if is_range else ''}")
+
+
+def parse_number(text: str | float) -> float:
+    """Return the number of a text with an optional decimal point; the default of an option is a number already.
+
+    Raises:
+        BadParameter: If the text is no number.
+    """
+    return _parse_as(float, text, "a number, such as 0.5")
+
+
+def _parse_as(kind: type[_Number], text: str | float, rule: str) -> _Number:
+    """Return ``kind(text)`` without the digits of other scripts and the separators that Python permits."""
+    try:
+        if not str(text).isascii() or "_" in str(text):
+            raise ValueError
+        return kind(text)
+    except ValueError:
+        raise typer.BadParameter(f"must be {rule} (got {text})") from None
+
+
+def parse_pair(text: str) -> tuple[int, int] | None:
+    """Return the two numbers of a text such as 1280x720, or None for other text."""
+    found = re.fullmatch("([0-9]{1,9})x([0-9]{1,9})", text.lower())
+    return None if found is None else (int(found[1]), int(found[2]))
 
 
 def given_options(context: typer.Context) -> set[str]:
@@ -113,10 +172,10 @@ def scene_overrides(
         raise InputError(f"--seed must be >= 0 (got {seed})")
     overrides: dict[str, object] = {"seed": seed, "quality": quality}
     if size is not None:
-        width, _, height = size.lower().partition("x")
-        if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+        pair = parse_pair(size)
+        if pair is None or 0 in pair:
             raise InputError(f"--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got {size})")
-        overrides |= {"output.width": int(width), "output.height": int(height)}
+        overrides |= {"output.width": pair[0], "output.height": pair[1]}
     if formats is not None:
         names = [name.strip() for name in formats.split(",")]
         if unknown := [name for name in names if name not in FORMATS]:

@@ -25,6 +25,8 @@ from mitsplat.cli.options import (
     Seed,
     ShDegree,
     check_new,
+    parse_number,
+    parse_pair,
     uniform_material,
 )
 from mitsplat.errors import InputError, PartialResultError
@@ -429,10 +431,9 @@ def _capture_settings(
 def _parse_board(squares: str, square: float) -> Board:
     from mitsplat.capture.boards.targets import Board
 
-    columns, _, rows = squares.lower().partition("x")
-    if not (columns.isdecimal() and rows.isdecimal()):
+    if (counts := parse_pair(squares)) is None:
         raise InputError(f"--squares must be COLUMNSxROWS, such as 7x5 (got {squares})")
-    return Board(int(columns), int(rows), square)
+    return Board(*counts, square)
 
 
 def _print_result(done: AssetResult) -> None:
@@ -469,6 +470,6 @@ def _parse_duration(text: str) -> float:
     """Return the time [s] of a text such as 90s, 10min or 1h."""
     for suffix, factor in (("min", 60.0), ("h", 3600.0), ("s", 1.0)):
         if text.endswith(suffix):
-            with suppress(ValueError):
-                return float(text.removesuffix(suffix)) * factor
+            with suppress(typer.BadParameter):
+                return parse_number(text.removesuffix(suffix)) * factor
     raise InputError(f"--budget must be a time such as 90s, 10min or 1h (got {text})")

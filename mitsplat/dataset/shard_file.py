@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,10 +35,10 @@ class Shard:
     @classmethod
     def parse(cls, text: str) -> Shard:
         """Parse a shard from a text such as ``2/8``."""
-        number, _, count = text.partition("/")
-        if not (number.isdecimal() and count.isdecimal()):
+        found = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", text)
+        if found is None:
             raise InputError(f"a shard must be I/N, such as 2/8 (got {text})")
-        return cls(int(number), int(count))
+        return cls(int(found[1]), int(found[2]))
 
     def frames(self, total: int, views: int) -> range:
         """Return the contiguous range of frames of this shard.

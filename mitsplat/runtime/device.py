@@ -32,7 +32,7 @@ Kind = Literal["cpu", "cuda"]
 GPU_NUMBER = "MITSPLAT_GPU"
 """Environment variable: N of the ``cuda:N`` that is the only visible GPU of this process."""
 
-_DEVICE = re.compile(r"cpu|auto|cuda(:all|:\d{1,4})?")
+_DEVICE = re.compile(r"cpu|auto|cuda(:all|:[0-9]{1,4})?")
 
 
 @dataclass(frozen=True)

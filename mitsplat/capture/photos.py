@@ -52,6 +52,13 @@ _MAX_NOISE = 0.02
 _PLAIN_BORDER = 0.5
 """Minimum fraction of the border of a photo that a plain background takes."""
 
+_LENS_TAGS = (
+    ExifTags.Base.Make,
+    ExifTags.Base.Model,
+    ExifTags.Base.FocalLength,
+    ExifTags.Base.FocalLengthIn35mmFilm,
+)
+"""EXIF data that differ between cameras and zoom settings."""
 _MAX_LABEL = 50
 """Largest value of a mask that stores labels in place of white."""
 
@@ -65,7 +72,7 @@ class Prepared:
         file: File of the copy.
         size: Width and height [px].
         orientation: EXIF orientation that was applied, 1 to 8 (1: none).
-        lens: Camera make and model, focal length and size; photos with equal values can share intrinsics.
+        lens: Width and height, and the camera make, model and focal length that the EXIF data state.
         pending: EXIF orientation that was not applied, 1 to 8 (1: none).
         opaque: Fraction of opaque pixels; None without an alpha channel.
     """
@@ -206,8 +213,8 @@ def _prepare(
         options: dict[str, int | bytes] = {"quality": 95, "subsampling": 0} if lossy else {}
         options["exif"] = _upright_exif(turned)
         write_file(file, lambda part: rgb.save(part, "JPEG" if lossy else "PNG", **options))
-    focal = details.get(ExifTags.Base.FocalLength), details.get(ExifTags.Base.FocalLengthIn35mmFilm)
-    lens = (details.get(ExifTags.Base.Make), details.get(ExifTags.Base.Model), *focal, *rgb.size)
+    stated = [details[tag] for tag in _LENS_TAGS if details.get(tag)]
+    lens = (*rgb.size, *stated)
     alpha, shown, opaque = alpha_channel(turned), np.ones(rgb.size[::-1], bool), None
     if alpha is not None:
         shown = np.asarray(alpha.resize(rgb.size, Image.Resampling.BOX)) >= 128

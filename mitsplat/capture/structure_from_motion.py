@@ -12,6 +12,7 @@ import os
 import sqlite3
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -45,6 +46,9 @@ SURE_AGREEMENT = 0.65
 
 ENOUGH = 0.8
 """Fraction of registered photos below which the global mapper is also tried."""
+
+MIN_FOLDER = 3
+"""Minimum number of photos without EXIF data in a folder that have intrinsics of their own."""
 
 _MODEL_PARTS = ("cameras", "images", "points3D")
 _READ_MEMORY = 2 << 30
@@ -209,18 +213,30 @@ def opencv_camera(
         raise InputError(f"a camera of lens model {model} cannot be used: {error}") from error
 
 
+def lens_groups(photos: Sequence[Prepared]) -> list[list[Prepared]]:
+    """Group the photos that share intrinsics: those of one size and equal EXIF data.
+
+    Without EXIF data, they are also of one folder, because another folder is often that of another camera or zoom
+    setting. Folders of fewer than :data:`MIN_FOLDER` photos form one group.
+    """
+    folders = [Path(photo.name).parent for photo in photos]
+    sizes = Counter((photo.lens, folder) for photo, folder in zip(photos, folders, strict=True))
+    groups: dict[tuple[tuple[str, ...], Path | None], list[Prepared]] = {}
+    for photo, folder in zip(photos, folders, strict=True):
+        is_apart = len(photo.lens) == 2 and sizes[photo.lens, folder] >= MIN_FOLDER
+        groups.setdefault((photo.lens, folder if is_apart else None), []).append(photo)
+    return list(groups.values())
+
+
 def _job(photos: Sequence[Prepared], folder: Path) -> JsonObject:
     """Return the job for the photos: finer features for few photos, sequential matching for many.
 
     The job has the photo folder relative to its own folder, so that results stay valid when both are moved together.
     """
-    groups: dict[tuple[str, ...], list[str]] = {}
-    for photo in photos:
-        groups.setdefault(photo.lens, []).append(photo.file.name)
     few, many = len(photos) <= 100, len(photos) > 150
     return {
         "images": os.path.relpath(photos[0].file.parent, folder),
-        "groups": list(groups.values()),
+        "groups": [[photo.file.name for photo in group] for group in lens_groups(photos)],
         "features": 8192 if few else 4096,
         "first_octave": -1 if few else 0,
         "matching": "sequential" if many else "exhaustive",

@@ -12,6 +12,7 @@ from PIL import ExifTags, Image
 
 from mitsplat.capture.capture import Photo
 from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
+from mitsplat.capture.structure_from_motion import lens_groups
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 
@@ -166,3 +167,21 @@ def test_exif_that_cannot_be_written_is_omitted(folder: Path, monkeypatch: pytes
     photo = prepare(folder)[0]["long.webp"]
     with Image.open(photo.file) as copy:
         assert copy.size == photo.size and not copy.getexif()
+
+
+def test_photos_without_exif_data_share_intrinsics_only_within_their_folder(tmp_path: Path) -> None:
+    """Two cameras, or two zoom settings of one, often differ by nothing but the folder of their photos."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker", "Phone"
+    folders = {"wide": 3, "tele": 3, "phone": 3, "phone/ring 2": 4, "rig/1": 1, "rig/2": 2}
+    for name, count in folders.items():
+        (tmp_path / "photos" / name).mkdir(parents=True)
+        options = {"exif": exif} if name.startswith("phone") else {}
+        for number in range(count):
+            Image.fromarray(texture(number)).save(tmp_path / f"photos/{name}/{number}.png", **options)
+    photos, rejected = prepare(tmp_path / "photos")
+    assert rejected == {}
+    groups = lens_groups(list(photos.values()))
+    together = sorted(sorted({Path(photo.name).parent.as_posix() for photo in group}) for group in groups)
+    assert together == [["phone", "phone/ring 2"], ["rig/1", "rig/2"], ["tele"], ["wide"]]
+    assert sum(map(len, groups)) == sum(folders.values())

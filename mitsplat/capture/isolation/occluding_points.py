@@ -42,7 +42,8 @@ def occluded_part(camera: Camera, own: Float64Array, others: Sequence[Float64Arr
         (H, W).
     """
     pixels, depths = camera.project(own)
-    size = float(np.ptp(pixels, axis=0).max()) if len(own) >= 3 and (depths > 0).all() else 0.0
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]  # the lens shows no points beyond the fold of its distortion
+    size = float(np.ptp(pixels, axis=0).max()) if len(pixels) >= 3 and (depths > 0).all() else 0.0
     if size <= 0:
         return 0.0, 0.0, np.zeros((camera.height, camera.width), dtype=bool)
     step, low = _EDGE / size, pixels.min(axis=0)

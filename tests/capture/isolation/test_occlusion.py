@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -73,3 +75,16 @@ def test_a_can_with_points_on_its_rims_only_may_hide_the_object() -> None:
     rims = [np.column_stack([0.04 * np.cos(turns), 0.04 * np.sin(turns) - 0.2, np.full(60, z)]) for z in (-0.04, 0.04)]
     occluded, possibly_occluded, _ = occluded_part(CAMERA, ball((0, 0, 0)), [np.concatenate(rims)])
     assert occluded < 0.7 and possibly_occluded > 0.95
+
+
+@pytest.mark.filterwarnings("error")
+def test_points_beyond_the_fold_of_the_lens_do_not_change_the_outline() -> None:
+    """A wrong camera can see points of the object at angles that its distortion does not describe."""
+    camera = replace(CAMERA, distortion=(-30.0, 0.0, 0.0, 0.0))
+    beyond = np.array([[4.0, 0.0, 0.0], [-4.0, 0.1, 0.0]])
+    assert np.isnan(camera.project(beyond)[0]).all()
+    own, before = ball((0, 0, 0)), [ball((0.04, -0.2, 0))]
+    share = hidden_share(camera, own, before)
+    assert 0.1 < share < 0.6
+    assert hidden_share(camera, np.vstack([own, beyond]), before) == share
+    assert hidden_share(camera, np.vstack([beyond, beyond]), before) == 0

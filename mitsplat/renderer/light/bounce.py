@@ -95,58 +95,91 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
     hit small bright regions such as a wall near a lamp. Light of near surfaces changes over short distances, so that
     less of this mean counts there (Ward et al. 1988, "A Ray Tracing Solution for Diffuse Interreflection").
     """
-    surface, view, pixel = tracer.surface, tracer.view, tracer.pixel
-    cells = replace(view, width=-(-view.width // 2), height=-(-view.height // 2))
-    x, y = pixel % view.width, pixel // view.width
-    column, row = x >> 1, y >> 1
-    selected = ((x & 1) == (row & 1)) & (
-        (y & 1) == ((column + row) & 1)
-    )  # equally often in each row and in each column
-    if tracer.lattice is not None:
-        selected |= dr.gather(mi.Bool, tracer.lattice, pixel)
+    surface, pixel = tracer.surface, tracer.pixel
     thing, count = surface.instance > 0, dr.width(pixel)
-    relit, static = dr.zeros(mi.Color3f, count), dr.zeros(mi.Color3f, count)
-    known = dr.zeros(mi.Float, count)
-    on_mesh = surface.relit & ~thing & selected
     captured = mi.Bool(False)
     if cover is not None:
         shaded = dr.sum(estimate.lit) < MAX_SHARE * dr.sum(estimate.base)
         captured = _captured(surface) & (shaded | (dr.gather(mi.Float, cover, pixel) > MIN_COVER))
-    diffuse = surface.relit & thing & surface.diffuse
-    few = captured & selected
-    for which, rays, in_cells in ((diffuse, BOUNCE_RAYS, False), (few, CELL_RAYS, True), (on_mesh, MESH_RAYS, True)):
+    selected = _one_pixel_of_each_cell(tracer)
+    with_objects, static = dr.zeros(mi.Color3f, count), dr.zeros(mi.Color3f, count)
+    known = dr.zeros(mi.Float, count)
+    for which, trace in (
+        (surface.relit & thing & surface.diffuse, _trace_objects),
+        (captured & selected, _trace_surroundings),
+        (surface.relit & ~thing & selected, _trace_meshes),
+    ):
         places = dr.compress(which)
-        if not dr.width(places):
-            continue
-        own, number = gathered(surface, places), dr.gather(mi.UInt32, pixel, places)
-        cell = dr.gather(mi.UInt32, row * cells.width + column, places)
-        start = tracer.start_at(cell % cells.width, cell // cells.width) if in_cells else tracer.sequence_start(number)
-        origin, normal = mi.Point3f(ray_origin(own)), mi.Vector3f(own.normal)
-        dr.eval(own, start, origin, normal, cell)
-        found, without, nearness = reflectors.irradiance(origin, normal, start, STRIDE, rays, _two_points)
-        if in_cells:
-            values = [*found, *without, dr.sum(found) * nearness]
-            *means, near = LightFilter(own, cells, cell).average(values)
-            found, without = mi.Color3f(*means[:3]), mi.Color3f(*means[3:])
-            if which is on_mesh:
-                wide = mi.Color3f(*LightFilter(own, cells, cell, stride=RADIUS).average(means[:3]))
-                share = dr.clip(SPREAD * own.offset * near / dr.maximum(dr.sum(found), 1e-20), 0, 1)
-                found = dr.lerp(wide, found, share)
-        dr.scatter(relit, found, places)
-        dr.scatter(static, without, places)
-        dr.scatter(known, mi.Float(1), places)
-        dr.eval(relit, static, known)
+        if dr.width(places):
+            found, without = trace(tracer, reflectors, places)
+            dr.scatter(with_objects, found, places)
+            dr.scatter(static, without, places)
+            dr.scatter(known, mi.Float(1), places)
+            dr.eval(with_objects, static, known)
     places = dr.compress(captured)
-    both = mi.Color3f(0), mi.Color3f(0)
+    filtered = mi.Color3f(0), mi.Color3f(0)
     if dr.width(places):
         own = gathered(surface, places)
-        columns = [dr.gather(mi.Float, c, places) for c in (*relit, *static, known)]
+        columns = [dr.gather(mi.Float, column, places) for column in (*with_objects, *static, known)]
         dr.eval(own, columns)
-        *columns, share = LightFilter(own, view, dr.gather(mi.UInt32, pixel, places)).average(columns)
-        both = dr.zeros(mi.Color3f, count), dr.zeros(mi.Color3f, count)
-        for total, colours in zip(both, (columns[:3], columns[3:]), strict=True):
+        *columns, share = LightFilter(own, tracer.view, dr.gather(mi.UInt32, pixel, places)).average(columns)
+        filtered = dr.zeros(mi.Color3f, count), dr.zeros(mi.Color3f, count)
+        for total, colours in zip(filtered, (columns[:3], columns[3:]), strict=True):
             dr.scatter(total, dr.select(share > 1e-6, mi.Color3f(*colours) / share, 0), places)
-    return Bounce((relit, known), both)
+    return Bounce((with_objects, known), filtered)
+
+
+def _one_pixel_of_each_cell(tracer: ShadowTracer) -> mi.Bool:
+    """Return True for one pixel of each cell of 2 x 2, equally often in each row and in each column."""
+    x, y = tracer.pixel % tracer.view.width, tracer.pixel // tracer.view.width
+    selected = ((x & 1) == (y >> 1 & 1)) & ((y & 1) == ((x >> 1) + (y >> 1) & 1))
+    return selected if tracer.lattice is None else selected | dr.gather(mi.Bool, tracer.lattice, tracer.pixel)
+
+
+def _trace_objects(tracer: ShadowTracer, reflectors: Reflectors, places: mi.UInt32) -> tuple[mi.Color3f, mi.Color3f]:
+    """Trace the irradiance with and without dynamic objects at places, from each pixel on its own."""
+    own, pixel = gathered(tracer.surface, places), dr.gather(mi.UInt32, tracer.pixel, places)
+    found, without, _ = _irradiance(reflectors, own, tracer.sequence_start(pixel), BOUNCE_RAYS)
+    return found, without
+
+
+def _trace_surroundings(
+    tracer: ShadowTracer, reflectors: Reflectors, places: mi.UInt32
+) -> tuple[mi.Color3f, mi.Color3f]:
+    """Trace the irradiance with and without dynamic objects at places, one per cell, as a mean over cells."""
+    found, without, *_ = _trace_cells(tracer, reflectors, places, CELL_RAYS)
+    return found, without
+
+
+def _trace_meshes(tracer: ShadowTracer, reflectors: Reflectors, places: mi.UInt32) -> tuple[mi.Color3f, mi.Color3f]:
+    """Trace as :func:`_trace_surroundings`, and use a wider mean where no reflecting surface is near."""
+    found, without, near, light_filter = _trace_cells(tracer, reflectors, places, MESH_RAYS)
+    own = light_filter.here
+    wide = LightFilter(own, light_filter.view, light_filter.index, stride=RADIUS).average([*found])
+    share = dr.clip(SPREAD * own.offset * near / dr.maximum(dr.sum(found), 1e-20), 0, 1)
+    return dr.lerp(mi.Color3f(*wide), found, share), without
+
+
+def _trace_cells(
+    tracer: ShadowTracer, reflectors: Reflectors, places: mi.UInt32, rays: int
+) -> tuple[mi.Color3f, mi.Color3f, mi.Float, LightFilter]:
+    """Return means over cells: irradiance with and without dynamic objects, its nearness, and the filter over cells."""
+    own, pixel = gathered(tracer.surface, places), dr.gather(mi.UInt32, tracer.pixel, places)
+    width, height = -(-tracer.view.width // 2), -(-tracer.view.height // 2)
+    cell = (pixel // tracer.view.width >> 1) * width + (pixel % tracer.view.width >> 1)
+    found, without, nearness = _irradiance(reflectors, own, tracer.start_at(cell % width, cell // width), rays)
+    light_filter = LightFilter(own, replace(tracer.view, width=width, height=height), cell)
+    *means, near = light_filter.average([*found, *without, dr.sum(found) * nearness])
+    return mi.Color3f(*means[:3]), mi.Color3f(*means[3:]), near, light_filter
+
+
+def _irradiance(
+    reflectors: Reflectors, own: LitSurface, start: mi.UInt32, rays: int
+) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
+    """Return :meth:`Reflectors.irradiance` at points, whose rays begin at ``start`` in their sequence."""
+    origin, normal = mi.Point3f(ray_origin(own)), mi.Vector3f(own.normal)
+    dr.eval(own, start, origin, normal)
+    return reflectors.irradiance(origin, normal, start, STRIDE, rays, _two_points)
 
 
 def _two_points(i: mi.UInt32) -> tuple[mi.Point2f, mi.Point2f]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import drjit as dr
 import mitsuba as mi
 
+from mitsplat.renderer.light.error_target import allowed_error, metered_exposure
 from mitsplat.renderer.light.light_estimate import Estimate, LightMeans
 from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.rays.camera_rays import CameraView
@@ -42,20 +45,6 @@ GAIN = 10.0
 ``python -m benchmarks.light.traced`` measures 0.6 of a wanted error of 0.03 over all shadows.
 """
 
-MID_GREY = 0.5
-"""Mid-grey irradiance as a share of white. The wanted standard error applies at this level."""
-
-MIN_LIGHT = 0.05
-"""Light level below which the tolerated error does not decrease further."""
-
-DISPLAY = 1 / 2.2
-"""Exponent of displayed light. Displayed values are perceptually even, and files store them in even steps."""
-
-_STEPS = 1 << 20
-"""Integer steps of displayed light 1, fine enough for light of 1e-8; integer sums do not depend on the number of
-threads.
-"""
-
 UNTRACED = 0xFFFFFFFF
 """Place of a pixel without traced light."""
 
@@ -65,8 +54,34 @@ class _Traits:
 
     POSITION, NORMAL = slice(0, 3), slice(3, 6)
     TRAIT, KNOWN, RAYS = range(6, 9)
-    SHARE, VARIANCE = range(9, 11)
+    GUIDE, VARIANCE = range(9, 11)
     MIRRORED, GLOSS = slice(11, 14), 14
+
+
+class Guide(NamedTuple):
+    """Estimate that limits the average: neighbours count as far as noise explains their difference.
+
+    Attributes:
+        value: Light share or brightness at each pixel of the filter.
+        variance: Variance of ``value``.
+    """
+
+    value: mi.Float
+    variance: mi.Float
+
+
+class _Lobe(NamedTuple):
+    """Reflection that limits the average: neighbours of the same gloss that mirror similar directions count.
+
+    Attributes:
+        mirrored: Mean of the directions that a pixel mirrors.
+        min_cosine: Smallest cosine between the directions of two neighbours.
+        gloss: Roughness plus twice the metalness.
+    """
+
+    mirrored: mi.Vector3f
+    min_cosine: mi.Float
+    gloss: mi.Float
 
 
 class LightFilter:
@@ -106,13 +121,13 @@ class LightFilter:
         dr.eval(self.place)
         # Untraced pixels of coarse tiles map to the traced pixel of their 2 x 2 cell. Otherwise neighbours in every
         # second column would find fewer samples.
-        self.shown = self.place
+        self.nearest_place = self.place
         if coarse is not None:
             pixel = dr.arange(mi.UInt32, view.width * view.height)
             x, y = pixel % view.width, pixel // view.width
-            stands = (y - (y & 1)) * view.width + x - (x & 1)
-            self.shown = dr.select(coarse, dr.gather(mi.UInt32, self.place, stands, coarse), self.place)
-            dr.eval(self.shown)
+            traced = (y - (y & 1)) * view.width + x - (x & 1)
+            self.nearest_place = dr.select(coarse, dr.gather(mi.UInt32, self.place, traced, coarse), self.place)
+            dr.eval(self.nearest_place)
 
     def rays_for(
         self, estimate: Estimate, error: float, unshadowed: mi.Float, others: mi.UInt32 | None = None
@@ -135,8 +150,8 @@ class LightFilter:
         share, variance, shared = self._share(estimate)
         light, exposure = unshadowed * share, mi.Float(1)
         if others is not None:
-            exposure = _metered(light, self.stride * self.stride, others)
-        error = _allowed_error(error, light * exposure)
+            exposure = metered_exposure(light, self.stride * self.stride, others)
+        error = allowed_error(error, light * exposure)
         return estimate.rays * variance * dr.square(unshadowed * exposure / error) / _gain(shared), exposure
 
     def smooth(self, estimate: Estimate, bounced: tuple[mi.Color3f, mi.Float] | None = None) -> LightMeans:
@@ -147,7 +162,7 @@ class LightFilter:
         """
         weight = dr.rcp(dr.maximum(estimate.rays, 1))
         values = [c * weight for c in (*estimate.lit, *estimate.base)]
-        values, _ = self._average(values, estimate.rays, RADIUS, self._share(estimate)[:2])
+        values, _ = self._average(values, estimate.rays, RADIUS, Guide(*self._share(estimate)[:2]))
         mean_bounced = None
         if bounced is not None:  # shadows of lamps do not limit its average
             *colour, share = self.average([*bounced[0], bounced[1]])
@@ -160,7 +175,7 @@ class LightFilter:
         mirrored: mi.Vector3f,
         radius: int = RADIUS,
         *,
-        guide: tuple[mi.Float, mi.Float] | None = None,
+        guide: Guide | None = None,
     ) -> tuple[list[mi.Float], mi.Float]:
         """Average reflected light per ray over neighbours that mirror similar directions.
 
@@ -172,7 +187,7 @@ class LightFilter:
             mirrored: Mean of the directions that a pixel mirrors. It is short where they differ, and such pixels are
                 averaged only with a ``guide``.
             radius: Radius of the filter [px].
-            guide: Brightness and its variance. Neighbours whose brightness differs by no more than noise may mirror
+            guide: Brightness. Neighbours whose brightness differs by no more than noise may mirror
                 directions that are farther apart.
 
         Returns:
@@ -184,7 +199,7 @@ class LightFilter:
         closeness = dr.cos(dr.clip(share * dr.square(here.roughness), 1e-3, 1))
         dr.eval(closeness, gloss)
         even = dr.full(mi.Float, 1, dr.width(self.index))
-        return self._average(values, even, radius, guide, (mirrored, closeness, gloss))
+        return self._average(values, even, radius, guide, _Lobe(mirrored, closeness, gloss))
 
     def reflections_for(
         self,
@@ -214,7 +229,7 @@ class LightFilter:
         # Own samples would stop at small variance and large values by chance, so that the picture would be too bright.
         (variance,), _ = self._average([variance], rays, 1)
         (mean,), shared = self.mirror([mean], mirrored, 1)
-        return variance / (dr.square(_allowed_error(error, mean)) * _gain(shared))
+        return variance / (dr.square(allowed_error(error, mean)) * _gain(shared))
 
     def _share(self, estimate: Estimate) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return the light share over 3 x 3 pixels, its variance, and the number of pixels that contribute."""
@@ -237,30 +252,25 @@ class LightFilter:
         values: list[mi.Float],
         rays: mi.Float,
         radius: int,
-        share: tuple[mi.Float, mi.Float] | None = None,
-        lobe: tuple[mi.Vector3f, mi.Float, mi.Float] | None = None,
+        guide: Guide | None = None,
+        lobe: _Lobe | None = None,
     ) -> tuple[list[mi.Float], mi.Float]:
-        """Return averages, and the effective number of equally weighted pixels with the same number of rays.
-
-        If ``share`` (light share and variance) is given, neighbours count as far as noise explains the difference of
-        their shares. If ``lobe`` (mirrored direction, smallest cosine between two of them, gloss) is given, only
-        neighbours of the same gloss that mirror similar directions count.
-        """
+        """Return averages, and the effective number of equally weighted pixels with the same number of rays."""
         here = self.here
         known = dr.select(here.known, mi.Float(1), 0)
-        guide = [*(share or (0, 0)), *([] if lobe is None else [*lobe[0], lobe[2]])]
-        traits = packed([*here.position, *here.normal, here.trait, known, rays, *guide])  # see _Traits
-        alike, count, noise = mi.Float(1), len(values), NOISE_LIMIT
-        values = values if share is None else [*values, share[0]]
+        limits = [*(guide or (0, 0)), *([] if lobe is None else [*lobe.mirrored, lobe.gloss])]
+        traits = packed([*here.position, *here.normal, here.trait, known, rays, *limits])  # see _Traits
+        shared, count, noise = mi.Float(1), len(values), NOISE_LIMIT
+        values = values if guide is None else [*values, guide.value]
         for direction in ((1, 0), (0, 1)):
-            values, along = self._average_along(values, traits, direction, radius, share, lobe, noise)
-            alike *= along
-            dr.eval(values, alike)
-            if share is not None:
-                share, noise = (values[count], share[1]), noise * SECOND_NOISE
+            values, along = self._average_along(values, traits, direction, radius, guide, lobe, noise)
+            shared *= along
+            dr.eval(values, shared)
+            if guide is not None:
+                guide, noise = guide._replace(value=values[count]), noise * SECOND_NOISE
                 row = dr.arange(mi.UInt32, dr.width(self.index)) * (dr.width(traits) // dr.width(self.index))
-                dr.scatter(traits, share[0], row + _Traits.SHARE)
-        return values[:count], alike
+                dr.scatter(traits, guide.value, row + _Traits.GUIDE)
+        return values[:count], shared
 
     def _average_along(
         self,
@@ -268,15 +278,15 @@ class LightFilter:
         traits: mi.Float,
         direction: tuple[int, int],
         radius: int,
-        share: tuple[mi.Float, mi.Float] | None,
-        lobe: tuple[mi.Vector3f, mi.Float, mi.Float] | None,
+        guide: Guide | None,
+        lobe: _Lobe | None,
         noise: float,
     ) -> tuple[list[mi.Float], mi.Float]:
         """Average over pixels up to ``radius`` away along a direction (x, y); the outermost pixels have half weight.
 
         The loop is symbolic, because tracing a step on the host takes as long as its execution on the device.
         """
-        here, view, width = self.here, self.view, dr.width(self.index)
+        view, width = self.view, dr.width(self.index)
         x, y = mi.Int32(self.index % view.width), mi.Int32(self.index // view.width)
         along_x, along_y = (dr.opaque(mi.Int32, step) * self.stride for step in direction)
         images, columns = packed(values), dr.width(traits) // width
@@ -290,33 +300,16 @@ class LightFilter:
             signed = dr.select((step & 1) == 0, -mi.Int32(distance), mi.Int32(distance))
             nx, ny = x + signed * along_x, y + signed * along_y
             inside = (nx >= 0) & (nx < view.width) & (ny >= 0) & (ny < view.height)
-            place = dr.gather(mi.UInt32, self.shown, mi.UInt32(ny * view.width + nx), inside)
-            same = inside & (place != UNTRACED)
-            other = dr.gather(mi.ArrayXf, traits, place, same, shape=(columns, width))
-            position, normal = mi.Point3f(*other[_Traits.POSITION]), mi.Vector3f(*other[_Traits.NORMAL])
-            trait, known, rays = other[_Traits.TRAIT], other[_Traits.KNOWN] > 0, other[_Traits.RAYS]
-            same &= trait == here.trait
-            plane = dr.abs(dr.dot(here.normal, position - here.position))
-            near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * mi.Float(8 * distance))
-            likely = mi.Float(1)
-            if share is not None:
-                difference, variance = other[_Traits.SHARE] - share[0], limit * (share[1] + other[_Traits.VARIANCE])
-                likely = dr.square(dr.maximum(1 - dr.square(difference) / dr.maximum(variance, 1e-20), 0))
-            if lobe is not None:
-                towards = mi.Vector3f(*other[_Traits.MIRRORED])
-                # Both are the cosine of unit vectors. The second one accepts equal mean directions of any length.
-                cosine = dr.dot(towards, lobe[0]) if share is None else 1 - dr.squared_norm(towards - lobe[0]) / 2
-                near &= cosine > lobe[1]
-                near &= dr.abs(other[_Traits.GLOSS] - lobe[2]) < SAME_GLOSS
-            alike = near & (known == here.known)
-            same &= alike | (known & ~here.known)
+            place = dr.gather(mi.UInt32, self.nearest_place, mi.UInt32(ny * view.width + nx), inside)
+            traced = inside & (place != UNTRACED)
+            other = dr.gather(mi.ArrayXf, traits, place, traced, shape=(columns, width))
+            similar, weight = self._similarity(other, distance, guide, lobe, limit)
+            similar &= traced
             # With half weights at the ends, the filter spans exactly one period of the dither.
-            weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(distance == last, mi.Float(0.5), 1.0)
-            # Shadows at contacts change from row to row: the nearest known neighbours of other points count most.
-            weight *= dr.select(alike, likely, dr.rcp(dr.square(dr.square(mi.Float(distance)))))
-            squares += dr.select(same, weight * weight * rays, 0)
-            weight = dr.select(same, weight * rays, 0)
-            theirs = dr.gather(mi.ArrayXf, images, place, same, shape=(_padded(len(values)), width))
+            weight *= dr.select(distance == last, mi.Float(0.5), 1.0)
+            squares += dr.select(similar, weight * weight * other[_Traits.RAYS], 0)
+            weight = dr.select(similar, weight * other[_Traits.RAYS], 0)
+            theirs = dr.gather(mi.ArrayXf, images, place, similar, shape=(_padded(len(values)), width))
             # Sums of differences from the centre leave the value bit-identical if all neighbours are equal.
             changed = [
                 dr.fma(weight, their - own, total)
@@ -324,13 +317,51 @@ class LightFilter:
             ]
             return step + 1, weights + weight, squares, *changed
 
-        own_weight = dr.select(here.known, mi.Float(1), GUESS_WEIGHT)
+        own_weight = dr.select(self.here.known, mi.Float(1), GUESS_WEIGHT)
         state = dr.zeros(mi.UInt32, width), own_rays * own_weight, own_rays * own_weight * own_weight
         sums = [dr.zeros(mi.Float, width) for _ in values]
         state = *state, *sums
         _, weights, squares, *sums = dr.while_loop(state, lambda step, *_: step < 2 * last, add, label="light filter")
         averages = [own + total / weights for own, total in zip(values, sums, strict=True)]
         return averages, weights * weights / (squares * own_rays)
+
+    def _similarity(
+        self, other: mi.ArrayXf, distance: mi.UInt32, guide: Guide | None, lobe: _Lobe | None, noise: mi.Float
+    ) -> tuple[mi.Bool, mi.Float]:
+        """Return whether a neighbour counts, and its weight per ray.
+
+        Args:
+            other: Columns of the neighbour, see :class:`_Traits`.
+            distance: Distance of the neighbour, in steps of the filter.
+            guide: Estimate that limits the average.
+            lobe: Reflection that limits the average.
+            noise: Squared difference of the guide at which the weight reaches 0, in variances.
+        """
+        here = self.here
+        position, normal = mi.Point3f(*other[_Traits.POSITION]), mi.Vector3f(*other[_Traits.NORMAL])
+        known = other[_Traits.KNOWN] > 0
+        plane = dr.abs(dr.dot(here.normal, position - here.position))
+        near = (dr.dot(here.normal, normal) > 0.95) & (plane < here.offset * mi.Float(8 * distance))
+        likely = mi.Float(1)
+        if guide is not None:
+            difference, variance = (
+                other[_Traits.GUIDE] - guide.value,
+                noise * (guide.variance + other[_Traits.VARIANCE]),
+            )
+            likely = dr.square(dr.maximum(1 - dr.square(difference) / dr.maximum(variance, 1e-20), 0))
+        if lobe is not None:
+            towards = mi.Vector3f(*other[_Traits.MIRRORED])
+            # Both are the cosine of unit vectors. The second one accepts equal mean directions of any length.
+            cosine = (
+                dr.dot(towards, lobe.mirrored) if guide is None else 1 - dr.squared_norm(towards - lobe.mirrored) / 2
+            )
+            near &= (cosine > lobe.min_cosine) & (dr.abs(other[_Traits.GLOSS] - lobe.gloss) < SAME_GLOSS)
+        alike = near & (known == here.known)
+        # Shadows at contacts change from row to row: the nearest known neighbours of other points count most.
+        weight = dr.select(known, 1.0, GUESS_WEIGHT) * dr.select(
+            alike, likely, dr.rcp(dr.square(dr.square(mi.Float(distance))))
+        )
+        return (other[_Traits.TRAIT] == here.trait) & (alike | (known & ~here.known)), weight
 
 
 def _gain(shared: mi.Float) -> mi.Float:
@@ -339,26 +370,6 @@ def _gain(shared: mi.Float) -> mi.Float:
     If few of these are similar, almost none of the more distant pixels are.
     """
     return dr.fma(GAIN - 1, dr.square((shared - 1) / (SMALL_FILTER_PIXELS - 1)), 1)
-
-
-def _allowed_error(error: float, light: mi.Float) -> mi.Float:
-    """Return the tolerated standard error at a light level, given that at ``MID_GREY``.
-
-    It follows the slope of the display curve.
-    """
-    return error * dr.power(dr.clip(light, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
-
-
-def _metered(light: mi.Float, area: mi.Int32, others: mi.UInt32) -> mi.Float:
-    """Return the exposure factor that makes the mean of a picture look like ``MID_GREY``.
-
-    Each value of ``light`` represents ``area`` pixels. The ``others`` count as 1.
-    """
-    # Opaque, because the sum of a literal would enter the kernel.
-    area = mi.UInt64(area + dr.opaque(mi.Int32, 0, dr.width(light)))
-    looks = mi.UInt64(dr.power(dr.maximum(light, 0), DISPLAY) * _STEPS + 0.5)
-    mean = mi.Float(dr.sum(looks * area) + mi.UInt64(others) * _STEPS) / mi.Float(dr.sum(area) + others)
-    return MID_GREY * dr.power(dr.maximum(mean / _STEPS, 1e-6), -1 / DISPLAY)
 
 
 def _padded(count: int) -> int:

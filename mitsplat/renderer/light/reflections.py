@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from mitsplat.renderer.emitters.emitter_sampling import receiver
 from mitsplat.renderer.interreflection.reflectors import LANES, Reflectors
-from mitsplat.renderer.light.light_filter import LightFilter, packed
+from mitsplat.renderer.light.light_filter import Guide, LightFilter, packed
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
 from mitsplat.renderer.materials.principled import power_weight, typical_brightness
 from mitsplat.renderer.rays.device_arrays import concatenated, gathered
@@ -180,9 +180,9 @@ def averaged_reflections(
     if dr.width(few):
         own, some = gathered(light_filter.here, few), [dr.gather(mi.Float, mean, few) for mean in means]
         brightness = typical_brightness(mi.Color3f(*some[:3]), mi.Color3f(*some[3:]))
-        guide = brightness, dr.gather(mi.Float, variance / shared, few)
+        guide = Guide(brightness, dr.gather(mi.Float, variance / shared, few))
         towards, pixels = dr.gather(mi.Vector3f, mirrored, few), dr.gather(mi.UInt32, light_filter.index, few)
-        dr.eval(own, some, guide, towards, pixels)
+        dr.eval(own, some, *guide, towards, pixels)
         wide, _ = LightFilter(own, light_filter.view, pixels).mirror(some, towards, guide=guide)
         dr.eval(means, wide)
         for mean, value in zip(means, wide, strict=True):

@@ -45,6 +45,8 @@ MAX_FAULTY = 0.01
 MIN_OPACITY = 1 / 255
 MIN_OVERLAP = 0.5
 MAX_OFFSET = 0.02
+MIN_KEYPOINT_SPREAD = 0.01
+"""Minimum distance between the first and the farthest keypoint, as a fraction of the longest extent."""
 MAX_SPREAD = 0.05
 """Maximum median distance between splats and mesh, as a fraction of the mesh's diagonal."""
 MIN_SPREAD_DIFFERENCE = 0.5
@@ -58,6 +60,7 @@ _ASSET_KEYS: Mapping[str, KeyPath] = {
     **dict.fromkeys(("mesh", "overlap", "offset", "watertightness"), ("mesh",)),
     "mass": ("mass",),
     "colliders": ("pieces",),
+    "keypoints": ("keypoints",),
 }
 """Keys of ``asset.yaml`` by the names of findings."""
 _SCENE_KEYS: Mapping[str, KeyPath] = {
@@ -120,6 +123,8 @@ def _asset_findings(asset: Asset) -> Iterator[Finding]:
     yield _up(asset, core)
     yield from _gaussians(asset, size)
     yield from _mesh(asset, core)
+    if asset.keypoints:
+        yield _keypoints(asset, core)
 
 
 def _units(asset: Asset, size: float) -> Finding:
@@ -195,6 +200,28 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
         f"{len(asset.pieces)} convex pieces; IoU of their box and the mesh's: {_overlap(joint, mesh.bounds):.0%}",
         "remove pieces from asset.yaml, so that they are computed from the mesh",
     )  # fmt: skip
+
+
+def _keypoints(asset: Asset, core: Float64Array) -> Finding:
+    """Find named points that seem to be in another unit: far from the object, or all at one place."""
+    points = asset.keypoint_array
+    low, high = (core.min(axis=0), core.max(axis=0)) if asset.mesh is None else asset.mesh.bounds
+    size = float((high - low).max())
+    outside = np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=1)
+    spread = float(np.linalg.norm(points - points[0], axis=1).max())
+    text = f"{len(points)} named points on the object or near it"
+    is_far, is_one = outside.max() > size, len(points) > 1 and spread < MIN_KEYPOINT_SPREAD * size
+    names = list(asset.keypoints)
+    if is_far:
+        text = (
+            f"{names[int(np.argmax(outside))]} lies {outside.max():.3g} m from the object, which measures {size:.3g} m"
+        )
+    elif is_one:
+        text = (
+            f"all {len(points)} lie within {1000 * spread:.3g} mm of {names[0]}, but the object measures {size:.3g} m"
+        )
+    remedy = "give keypoints in the units of the asset's files, see units in asset.yaml"
+    return Finding("keypoints", not (is_far or is_one), text, remedy)
 
 
 def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:

@@ -1,6 +1,7 @@
 """Preflight checks: a valid asset and scene pass; each inserted fault is found and comes with a remedy."""
 
 import json
+import re
 from contextlib import suppress
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ import trimesh
 from ruamel.yaml import YAML
 
 from mitsplat.asset import Asset
-from mitsplat.checks.path_checks import _SCENE_KEYS, SIZE_LIMITS, _located, _mass, check_asset, check_scene
+from mitsplat.checks.path_checks import _SCENE_KEYS, SIZE_LIMITS, _located, _mass, check_asset, check_path, check_scene
 from mitsplat.checks.scene_warnings import scene_warnings
 from mitsplat.errors import InputError
 from mitsplat.findings import Finding
@@ -47,6 +48,24 @@ def test_a_sound_asset_passes_every_check():
     assert wrong(check_asset(surroundings)) == {}
 
 
+def test_named_points_on_in_and_near_an_object_are_no_problem():
+    points = {"tip": (0, 0, 0.025), "grip": (0, 0, 0), "hand": (0, 0, 0.07)}
+    assert wrong(check_asset(replace(solid(), keypoints=points))) == {}
+    assert wrong(check_asset(replace(solid(), keypoints={"middle": (0, 0, 0)}))) == {}
+
+
+def test_named_points_in_another_unit_are_named_with_the_line_to_change(tmp_path):
+    replace(solid(), keypoints={"tip": (0.0, 0.0, 0.02), "grip": (0.0, 0.01, 0.0)}).save(
+        tmp_path / "box", splats="a.spz"
+    )
+    described = tmp_path / "box/asset.yaml"
+    assert wrong(check_path(tmp_path / "box")) == {}
+    described.write_text(re.sub(r"\b(10|20)\.0", lambda found: str(float(found[0]) / 1000), described.read_text()))
+    (problem,) = wrong(check_path(tmp_path / "box")).values()
+    assert problem.text == "all 2 lie within 0.0224 mm of tip, but the object measures 0.06 m"
+    assert re.fullmatch(r".*asset\.yaml:\d+: keypoints", str(problem.place))
+
+
 def changed(splats, rows, **values):
     arrays = {name: np.array(getattr(splats, name)) for name in ("means", "quats", "scales", "opacities", "sh")}
     for name, value in values.items():
@@ -72,6 +91,8 @@ FAULTS = {
     "offset": (replace(GOOD, mesh=GOOD.mesh.copy().apply_translation((0.005, 0, 0))), "register"),
     "watertightness": (replace(GOOD, mesh=OPEN), "close it"),
     "mass": (replace(GOOD, mass=50.0), "density"),
+    "keypoints": (replace(GOOD, keypoints={"tip": (0, 0, 2e-5), "grip": (0, 0, -2e-5)}), "units of the asset's files"),
+    "keypoints ": (replace(GOOD, keypoints={"tip": (0, 0, 25.0)}), "units of the asset's files"),
     "colliders": (replace(GOOD, pieces=(GOOD.mesh.slice_plane((0, 0, 0), (1, 0, 0), cap=True),)), "remove pieces"),
 }
 

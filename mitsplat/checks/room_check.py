@@ -52,11 +52,10 @@ def _first_crowded_layout(scene: Scene) -> str:
         layouts = min(scene.spec.output.layouts, MAX_LAYOUTS)
         for layout in range(layouts):
             static = drop.static_scenes[drop.static_key(layout)]
-            regions, half_fits = _crowded_regions(scene, layout, drop.start_poses, static)
-            if not regions:
+            text, half_fits = _crowded_regions(scene, layout, drop.start_poses, static)
+            if not text:
                 continue
             crowded += 1
-            text = f"layout {layout} has no room for all objects at the start: {'; '.join(regions)}"
             first = first or text
             if not half_fits:
                 return text
@@ -65,11 +64,11 @@ def _first_crowded_layout(scene: Scene) -> str:
     return ""
 
 
-def _crowded_regions(scene: Scene, layout: int, start_poses: StartPoses, static: StaticScene) -> tuple[list[str], bool]:
-    """Describe the regions that are too small for the objects of a layout; [] if all objects find room.
+def _crowded_regions(scene: Scene, layout: int, start_poses: StartPoses, static: StaticScene) -> tuple[str, bool]:
+    """Describe the regions that are too small for the objects of a layout; empty if all objects find room.
 
-    These are all regions of its objects if each of them has room without the others. The second value is True if half
-    of the objects find room.
+    The text begins with the key of the first of them. These are all regions of its objects if each of them has room
+    without the others. The second value is True if half of the objects find room.
     """
     spec = scene.spec
     arrangements = draw_arrangements(spec, layout)
@@ -80,11 +79,11 @@ def _crowded_regions(scene: Scene, layout: int, start_poses: StartPoses, static:
 
     items = start_poses.items(*draw_objects(scene, layout), draw_regions(spec, layout))
     if has_room(items):
-        return [], True
+        return "", True
     contents = {region: [item for item in items if item.region == region] for region in {item.region for item in items}}
     crowded = [region for region, some in contents.items() if len(contents) > 1 and not has_room(some)]
-    texts = [
-        f"{len(contents[region])} objects in {spec.region_names[region]}, {arrangements[region]}"
-        for region in crowded or contents
-    ]
-    return texts, has_room(items[: -(-len(items) // 2)])
+    shown = crowded or list(contents)
+    texts = [f"{len(contents[one])} objects in {spec.region_names[one]}, {arrangements[one]}" for one in shown]
+    key = "region" if shown[0] == 0 else f"regions[{shown[0] - 1}]"
+    text = f"{key} has no room for all objects of layout {layout} at the start: {'; '.join(texts)}"
+    return text, has_room(items[: -(-len(items) // 2)])

@@ -208,7 +208,10 @@ def test_a_region_that_is_too_small_for_an_arrangement_is_named(scene_data, writ
     (room,) = (finding for finding in check_scene(scene) if finding.name == "room")
     assert room.ok == (not crowded)
     if crowded:
-        assert room.text == f"layout 0 has no room for all objects at the start: {crowded}"
+        key = "regions[0]" if "shelf" in crowded else "region"
+        assert room.text == f"{key} has no room for all objects of layout 0 at the start: {crowded}"
+        line = _located(room, scene.path, _SCENE_KEYS).place
+        assert line.endswith(f": {key}") and int(line.split(":")[-2]) > 1
         with suppress(InputError):  # more than half of them have no room
             reasons = {one.reason for one in settle_layout(scene, 0, cached=False).left_out}
             assert reasons == {"no room for all in 1 of 1 draws"}

@@ -244,6 +244,15 @@ def test_each_fault_of_a_yolo_folder_is_one_sentence(tmp_path: Path, fault: str)
     assert "\n" not in str(told.value) and "run lengths (" not in str(told.value)
 
 
+def test_an_unfinished_dataset_is_refused_with_its_remedy(tmp_path: Path) -> None:
+    root = write_yolo(tmp_path, {"train": 2}, mitsplat=True)
+    (root / "data.yaml").unlink()
+    with pytest.raises(
+        InputError, match=r"must be a finished dataset \(there is no data\.yaml yet\): continue its `mi"
+    ):
+        read_set(root, "train")
+
+
 def test_a_dataset_that_lacks_a_label_is_refused(tmp_path: Path) -> None:
     root = write_yolo(tmp_path, {"train": 2}, mitsplat=True)
     (root / "labels/train/000001.txt").unlink()

@@ -62,7 +62,11 @@ def read_mitsplat(root: Path, split: Split, progress: Progress | None) -> Labell
     """
     if not (root / "labels").is_dir():
         raise InputError(f"{root}: training needs YOLO labels: add yolo to output.formats of the scene")
-    classes = _class_names(_read_yaml(root / "data.yaml"), root / "data.yaml")
+    described = root / "data.yaml"
+    if not described.is_file():
+        remedy = "continue its `mitsplat render`, or join its shards with `mitsplat merge`"
+        raise InputError(f"{root}: must be a finished dataset (there is no data.yaml yet): {remedy}")
+    classes = _class_names(_read_yaml(described), described)
     return _read_images(root, "mitsplat", split, classes, {name: [f"images/{name}"] for name in SPLITS}, progress)
 
 

@@ -406,9 +406,16 @@ def _hull(points: npt.NDArray[np.floating], place: str) -> trimesh.Trimesh:
 
 
 def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...]:
-    """Read a mesh file and return the convex hulls of its connected parts."""
-    parts = read_mesh(path, merge=False).split(only_watertight=False, repair=False)
-    return tuple(_hull(part.vertices, str(path)) for part in parts)
+    """Read a mesh file and return the convex hulls of its connected parts.
+
+    Faces with a common vertex are of one part. Hulls by Qhull can have faces without neighbours, which a search along
+    edges would take for parts.
+    """
+    mesh = read_mesh(path, merge=False)
+    labels = trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))
+    numbers = labels[mesh.faces[:, 0]]
+    parts = [mesh.vertices[np.unique(mesh.faces[numbers == number])] for number in dict.fromkeys(numbers.tolist())]
+    return tuple(_hull(part, str(path)) for part in parts)
 
 
 def _concatenated(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:

@@ -125,6 +125,16 @@ class TestRoundTrip:
         asset.save(tmp_path)
         assert [round(p.volume, 9) for p in Asset.load(tmp_path).pieces] == [round(p.volume, 9) for p in asset.pieces]
 
+    def test_faces_of_a_piece_that_meet_only_in_vertices_are_one_piece(self, asset, tmp_path):
+        """Qhull can leave such faces, on edges of more than two faces, in the hull of finely meshed curved parts."""
+        one, other = (piece.copy() for piece in asset.pieces)
+        stray = trimesh.Trimesh(one.vertices, [*one.faces, one.faces[0][::-1], one.faces[5]], process=False)
+        assert len(stray.split(only_watertight=False, repair=False)) > 1
+        replace(asset, pieces=(other, stray)).save(tmp_path)
+        found = Asset.load(tmp_path).pieces
+        assert [round(piece.volume, 9) for piece in found] == [round(piece.volume, 9) for piece in (other, one)]
+        assert all(piece.is_watertight for piece in found)
+
     def test_assets_that_could_not_be_read_are_not_saved(self, asset, tmp_path):
         for change, sentence in [
             ({"mesh": None, "pieces": ()}, "an object needs a mesh"),

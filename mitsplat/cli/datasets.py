@@ -412,7 +412,7 @@ def _export_scene(path: Path, frame: int, out: Path, *, mjcf: bool, allow_outsid
         from mitsplat.frames.mitsuba_xml import export_xml
 
         export_xml(scene, frame, out)
-        return ()
+        return () if scene.spec.background is None else ("the background image",)
     from mitsplat.usd.mjcf import export_scene_mjcf
     from mitsplat.usd.usd_export import export_scene_usd
 

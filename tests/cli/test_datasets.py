@@ -67,6 +67,22 @@ def test_export_writes_the_xml_of_the_frame(scene_path: Path, monkeypatch: pytes
     assert calls.args[1:] == (2, tmp_path / "a.xml")
 
 
+def test_export_names_the_background_that_no_xml_holds(
+    scene_data: dict[str, Any],
+    write_scene: WriteScene,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(xml_scene, "export_xml", Calls())
+    assert run("export", write_scene(scene_data), "-o", tmp_path / "a.xml") == 0
+    assert "not exported" not in capsys.readouterr().out
+    Image.new("RGB", (8, 8)).save(tmp_path / "wall.png")
+    scene = write_scene(scene_data | {"background": {"images": "wall.png"}})
+    assert run("export", scene, "-o", tmp_path / "a.xml") == 0
+    assert "not exported: the background image\n" in capsys.readouterr().out
+
+
 def test_settle_prints_certificates_and_writes_the_animation(
     scene_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

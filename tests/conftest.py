@@ -272,7 +272,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Ca
 def captured(
     photos: tuple[Path, dict[str, Camera]], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Path, CaptureResult]:
-    """Capture the rendered photos with one truncated photo among them, and return photos, folder and result."""
+    """Capture the rendered photos with a truncated one and a copy among them, and return photos, folder and result."""
     from mitsplat.capture.pipeline.capture_pipeline import capture_photos
     from mitsplat.capture.pipeline.capture_settings import CaptureSettings
     from tests import rendered
@@ -280,6 +280,7 @@ def captured(
     def make(folder: Path) -> None:
         given = Path(shutil.copytree(photos[0], folder / "given"))
         (given / "torn.png").write_bytes((given / "photo00.png").read_bytes()[:5000])
+        shutil.copyfile(given / "photo03.png", given / "photo03 (1).png")
         found.append(capture_photos(given, folder / "out", settings))
 
     settings = CaptureSettings(board=rendered.BOARD)

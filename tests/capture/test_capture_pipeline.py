@@ -44,7 +44,9 @@ def test_cameras_of_rendered_photos_are_recovered(
     assert (capture.units, capture.up, capture.table) == ("metre", "z", True)
     assert set(capture.rejected) == {"torn.png"}
     assert capture.rejected["torn.png"].startswith("it cannot be read")
-    assert result.given == 17
+    assert result.given == 17  # without the copy
+    assert result.copies == ["photo03 (1).png"]
+    assert "1 of the files are copies of other photos and are left out: photo03 (1).png" in result.warnings
     assert result.shortcoming is None
     assert result.reprojection_error < 1
     assert {photo.name for photo in capture.photos} == set(truth)
@@ -210,7 +212,7 @@ def test_cameras_with_few_matches_are_named_unless_a_board_confirms_them(
     assert run("capture", given, "-o", tmp_path / "sure", "--square", 0.035, "--kind", "environment") == 0
     output = capsys.readouterr().out
     assert "rejected: photo03.png: its camera is wrong: it agrees with only 40% of its matches\n" in output
-    assert "warning" not in output
+    assert output.count("warning: ") == output.count("are copies of other photos") == 1
     monkeypatch.setattr("mitsplat.capture.alignment.target_evidence._fit_board", lambda *args: None)
     for _ in range(2):  # first computed, then reused
         assert run("capture", given, "-o", tmp_path / "out", "--kind", "environment") == 0

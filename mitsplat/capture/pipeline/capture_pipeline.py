@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,7 @@ _MAX_HIDDEN = 0.5
 _INPUTS = "inputs.json"
 _PHOTOS = "sfm/photos.json"
 """Record of the inputs of the photo copies; written before the copies."""
-_RESULT_FIELDS = ("source", "reprojection_error", "doubtful", "unnamed")
+_RESULT_FIELDS = ("source", "reprojection_error", "doubtful", "unnamed", "copies")
 """Fields of a result that ``inputs.json`` stores in addition to the inputs."""
 
 
@@ -98,11 +99,12 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
     _delete_outdated(out, inputs, settings)
     names = [path.relative_to(photos).as_posix() for path in files]
     unnamed = [] if settings.poses is None else unnamed_photos(settings.poses, names, photos)
+    copies = _find_copies(inputs["photos"]) if settings.poses is None else []
     prepared, rejected = prepare_photos(
         photos,
         out / "images",
         but=settings.masks,
-        skip=set(unnamed),
+        skip={*unnamed, *copies},
         max_size=settings.max_size,
         upright=settings.poses is None,
         masks=settings.masks,
@@ -137,8 +139,8 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
             path.unlink()
     write_file(out / "capture.png", lambda part: capture_sheet(capture).save(part, "PNG"))
     doubtful = _doubtful_photos(model, frame, by_file, {photo.name for photo in capture.photos})
-    given_count = len(files) - len(unnamed)
-    result = CaptureResult(capture, given_count, frame.source, model.reprojection_error, doubtful, unnamed)
+    count = len(files) - len(unnamed) - len(copies)
+    result = CaptureResult(capture, count, frame.source, model.reprojection_error, doubtful, unnamed, copies)
     record = {key: getattr(result, key) for key in _RESULT_FIELDS}
     write_text(out / _INPUTS, json.dumps({"inputs": inputs, **record}, indent=1))
     return result
@@ -197,7 +199,18 @@ def _check_outputs(out: Path, photos: Path, settings: CaptureSettings) -> None:
             raise InputError(f"{folder}: already exists and is not part of a capture: choose another folder")
 
 
-def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, object]:
+def _find_copies(hashes: Mapping[str, str]) -> list[str]:
+    """Return the names of files whose content is that of a file with a shorter name; the mapping has hashes by name.
+
+    A copy of a training photo among the held-out photos would make the result look better than it is.
+    """
+    first: dict[str, str] = {}
+    for name in sorted(hashes, key=len):
+        first.setdefault(hashes[name], name)
+    return [name for name, content in hashes.items() if first[content] != name]
+
+
+def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, Any]:
     """Return the inputs of a capture as JSON values: hashes of file contents, without absolute paths."""
     given = {name: getattr(settings, name) for name in ("poses", "masks", "mask_model")}
     kept = {name: value for name, value in asdict(settings).items() if name not in ("frames", *given)}
@@ -209,7 +222,7 @@ def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> d
     }
 
 
-def _load_finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None:
+def _load_finished(out: Path, inputs: dict[str, Any]) -> CaptureResult | None:
     """Return the result stored in ``out`` if it has the same inputs, else None."""
     try:
         record = json.loads((out / _INPUTS).read_text())
@@ -217,12 +230,13 @@ def _load_finished(out: Path, inputs: dict[str, object]) -> CaptureResult | None
             return None
         capture = Capture.load(out)
         stored = {key: record[key] for key in _RESULT_FIELDS}
-        return CaptureResult(capture, len(record["inputs"]["photos"]) - len(stored["unnamed"]), **stored)
+        count = len(record["inputs"]["photos"]) - len(stored["unnamed"]) - len(stored["copies"])
+        return CaptureResult(capture, count, **stored)
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: recompute
         return None
 
 
-def _delete_outdated(out: Path, inputs: dict[str, object], settings: CaptureSettings) -> None:
+def _delete_outdated(out: Path, inputs: dict[str, Any], settings: CaptureSettings) -> None:
     """Delete masks, and delete copies and matches of other photographs or other settings."""
     way = settings.max_size, settings.poses is None, settings.undistorted
     marker = json.dumps([inputs["photos"], *way], sort_keys=True)

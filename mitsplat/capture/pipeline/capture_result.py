@@ -25,11 +25,12 @@ class CaptureResult:
 
     Attributes:
         capture: Capture as stored in its folder.
-        given: Number of input photographs, without those in ``unnamed``.
+        given: Number of input photographs, without those in ``unnamed`` and ``copies``.
         source: Origin of scale and gravity, as a clause.
         reprojection_error: Mean reprojection error over all observations [px].
         doubtful: Low fractions of matches that agree with the camera, by photo; without cameras that a board confirms.
         unnamed: Pictures in the folder that the given ``transforms.json`` does not name; they are left out.
+        copies: Photos whose file is equal to that of another photo; they are left out.
         video: Chosen video frames, or None for photographs.
     """
 
@@ -39,6 +40,7 @@ class CaptureResult:
     reprojection_error: float
     doubtful: Mapping[str, float]
     unnamed: Sequence[str] = ()
+    copies: Sequence[str] = ()
     video: ChosenFrames | None = None
 
     @property
@@ -63,11 +65,11 @@ class CaptureResult:
         """Warnings about photos in the capture, one sentence each."""
         warnings = [] if self.video is None else [*self.video.warnings]
         if self.unnamed:
-            others = f" and {more} more" if (more := len(self.unnamed) - _MAX_LISTED) > 0 else ""
-            warnings.append(
-                f"the poses do not name {len(self.unnamed)} pictures in the folder, which are left out: "
-                f"{', '.join(self.unnamed[:_MAX_LISTED])}{others}"
-            )
+            text = f"the poses do not name {len(self.unnamed)} pictures in the folder, which are left out"
+            warnings.append(f"{text}: {_first_of(self.unnamed)}")
+        if self.copies:
+            text = f"{len(self.copies)} of the files are copies of other photos and are left out"
+            warnings.append(f"{text}: {_first_of(self.copies)}")
         if self.doubtful:
             shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
             warnings.append(
@@ -92,3 +94,9 @@ class CaptureResult:
             f"{MIN_REGISTERED:.0%} are required: take sharp photos of one object at steps of about ten degrees, with "
             "texture below it and even light"
         )
+
+
+def _first_of(names: Sequence[str]) -> str:
+    """List the first names and the number of the others."""
+    others = f" and {more} more" if (more := len(names) - _MAX_LISTED) > 0 else ""
+    return f"{', '.join(names[:_MAX_LISTED])}{others}"

@@ -85,8 +85,8 @@ def render(
     workers: Annotated[
         int | None,
         typer.Option(
-            help="Number of worker processes; by default chosen by measured speed, and limited by the GPU "
-            "memory on GPUs."
+            help="Number of worker processes; by default one for every two cores, or for every core with GPUs, as far "
+            "as the memory suffices."
         ),
     ] = None,
     engine: Annotated[

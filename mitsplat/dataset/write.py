@@ -114,7 +114,7 @@ def write_dataset(
         frames: Number of frames of the dataset, all its shards together.
         shard: Part of the dataset to render here; all frames if None.
         workers: Number of processes that render frames, see :func:`mitsplat.engine.pool.run_frames`. None selects the
-            number that is worthwhile on this machine, or that fits into the cluster.
+            number that cores and memory of this machine allow, or that fits into the cluster.
         cluster: Cluster that renders the frames; processes of this machine if None.
         overwrite: Remove a dataset that is already in the folder.
         progress: Callback that is called after every finished frame and during slow steps.

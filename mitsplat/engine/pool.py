@@ -29,7 +29,11 @@ _HELPER_MEMORY = 2**30
 """Maximum memory of a helper process [bytes]."""
 
 CORES_PER_WORKER = 2
-"""Cores that the threads of a worker on a CPU keep busy. On two cores, two workers were not faster than one."""
+"""Cores that the threads of a worker on a CPU keep busy. On two cores, two workers were not faster than one.
+
+Threads wait for work by repeated tests. A worker with four threads for each core takes 2.2 times the CPU time per frame
+(``scenes/workcell.yaml``).
+"""
 
 _MAX_SERIAL_FRAMES = 16
 """Number of frames up to which worker processes are not worth their start-up time."""
@@ -68,13 +72,12 @@ def run_frames(
             function must therefore guard its main part by ``if __name__ == "__main__"``.
         layouts: Frame indices by layout.
         workers: Number of processes; 1 makes the frames in this process if it can compute on the device. None selects
-            the number automatically: on CPUs, as long as another worker speeds up the run; on GPUs, immediately the
-            number that cores and memory allow.
+            the number that cores and memory allow. Workers on a CPU share the cores.
         note: Callback that receives a short description of the current operation.
         memory: Memory of a worker, which limits an automatic number of workers.
         device: Device for the frames; each worker selects it first, and several GPUs are assigned in turn. None for
             work without a device.
-        prepare: Function that helper processes call with the layouts that the first workers do not begin with. Its
+        prepare: Function that helper processes call with the layouts that the workers do not begin with. Its
             failures are ignored, because ``make`` prepares what is missing.
 
     Raises:
@@ -88,9 +91,7 @@ def run_frames(
     check_workers(workers)
     total = sum(map(len, layouts.values()))
     max_workers = affordable_workers(memory, device) if workers is None else workers
-    # On a GPU, starting workers one by one would take longer than most runs.
-    grow = workers is None and (device is None or not device.gpus)
-    later = list(layouts)[1 if grow else max_workers :]  # the first workers begin with the others
+    later = list(layouts)[max_workers:]  # the workers begin with the others
     worthwhile = prepare is not None and total > _MAX_SERIAL_FRAMES and workers != 1
     helpers = min(len(later), _affordable_helpers(max_workers, memory)) if worthwhile else 0
     serial = total <= 1 or max_workers + helpers <= 1 or (workers is None and total <= _MAX_SERIAL_FRAMES)
@@ -111,10 +112,10 @@ def run_frames(
                     device,
                     environment,
                     partial(prepare, later) if prepare else None,
-                    None if workers is None else max(1, usable_cores() // workers),
+                    max(1, usable_cores() // max_workers),
                 )
             ) as pool,
-            closing(run_pool(pool, layouts, max_workers, note, grow=grow)) as found,
+            closing(run_pool(pool, layouts, max_workers, note)) as found,
         ):
             for _ in range(helpers):
                 pool.start_helper()

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from typing import Generic
 
 from mitsplat.engine.answers import Failure, Lost, LostWorkersError, Result, Status, WorkerPool
 from mitsplat.engine.frame_queue import FrameQueue
-from mitsplat.engine.worker_growth import WorkerGrowth
 from mitsplat.errors import MissingResourceError
 from mitsplat.progress import Note
 
@@ -18,7 +16,7 @@ MAX_LOSSES = 3
 
 
 def run_pool(
-    pool: WorkerPool[Result], layouts: Mapping[int, Sequence[int]], max_workers: int, note: Note, *, grow: bool = False
+    pool: WorkerPool[Result], layouts: Mapping[int, Sequence[int]], max_workers: int, note: Note
 ) -> Generator[Result]:
     """Distribute all frames over the pool's workers and yield the results in order of completion.
 
@@ -32,12 +30,11 @@ def run_pool(
         layouts: Frame indices by layout.
         max_workers: Maximum number of workers; at most one per frame is started.
         note: Callback that receives a short description of the current operation.
-        grow: Begin with one worker, and start the next one only while the last one sped up the run.
 
     Raises:
         InputError, MissingResourceError, FrameError, LostWorkersError: As :func:`mitsplat.engine.pool.run_frames`.
     """
-    yield from _Scheduler(pool, layouts, max_workers, note, grow=grow).run()
+    yield from _Scheduler(pool, layouts, max_workers, note).run()
 
 
 class _Scheduler(Generic[Result]):
@@ -49,21 +46,18 @@ class _Scheduler(Generic[Result]):
         layouts: Mapping[int, Sequence[int]],
         max_workers: int,
         note: Note,
-        *,
-        grow: bool,
     ) -> None:
-        self._pool, self._note, self._grow = pool, note, grow
+        self._pool, self._note = pool, note
         self._queue = FrameQueue(layouts)
         self._max_workers = min(max_workers, self._queue.left)
-        self._growth = WorkerGrowth(self._max_workers)
         self._losses: Counter[int] = Counter()
-        self._at_work: dict[int, tuple[int, float]] = {}  # frame, and the time when it was assigned
+        self._at_work: dict[int, int] = {}  # frame by worker
         self._gone = 0
         self._gone_at_start: dict[int, int] = {}  # by live worker: number of workers gone when it got its frame
 
     def run(self) -> Generator[Result]:
         """Yield the results."""
-        for _ in range(min(1, self._max_workers) if self._grow else self._max_workers):
+        for _ in range(self._max_workers):
             self._assign(self._pool.start())
         while self._at_work:
             for worker, answer in self._pool.wait():
@@ -76,7 +70,8 @@ class _Scheduler(Generic[Result]):
                 elif isinstance(answer, Failure):
                     self._handle_failure(worker, answer)
                 else:
-                    self._assign_next(worker)
+                    del self._at_work[worker]
+                    self._assign(worker)
                     yield answer.result
             for _ in range(self._pool.free_slots()):
                 if self._queue.left:
@@ -87,7 +82,7 @@ class _Scheduler(Generic[Result]):
         self._gone_at_start[worker] = self._gone
         if (task := self._queue.take(worker)) is not None:
             layout, frame = task
-            self._at_work[worker] = frame, time.monotonic()
+            self._at_work[worker] = frame
             self._pool.send_frame(worker, frame, layout)
 
     def _repeat_lost(self, worker: int, lost: Lost) -> None:
@@ -96,7 +91,7 @@ class _Scheduler(Generic[Result]):
         Raises:
             LostWorkersError: If the frame has terminated :data:`MAX_LOSSES` workers.
         """
-        frame, _ = self._at_work.pop(worker)
+        frame = self._at_work.pop(worker)
         del self._gone_at_start[worker]
         self._gone += 1
         self._losses[frame] += 1
@@ -107,18 +102,16 @@ class _Scheduler(Generic[Result]):
             )
         self._queue.put_back(worker, frame)
         self._note(f"the worker of frame {frame} {lost.how}: the frame is repeated")
-        self._grow = False
         if not self._at_work:
             self._assign(self._pool.start())
 
     def _handle_failure(self, worker: int, failure: Failure) -> None:
         """Repeat a frame for which memory did not suffice, with fewer workers; raise any other failure."""
-        frame, _ = self._at_work.pop(worker)
+        frame = self._at_work.pop(worker)
         if not failure.exhausted:
             raise failure.error(frame)
         self._queue.put_back(worker, frame)
         self._pool.stop(worker)
-        self._grow = False
         if self._gone_at_start.pop(worker) < self._gone:  # the missing memory may be free now
             self._assign(self._pool.start())
             return
@@ -129,23 +122,6 @@ class _Scheduler(Generic[Result]):
         self._note(f"memory ran out in frame {frame}, which is repeated with {left}")
         if not self._at_work:
             self._assign(next(iter(self._gone_at_start)))
-
-    def _assign_next(self, worker: int) -> None:
-        """Send a frame to a worker that has finished one, and adapt the number of workers to their speed."""
-        _, begin = self._at_work.pop(worker)
-        change = ""
-        if self._grow:
-            change = self._growth.decide(worker, len(self._at_work) + 1, begin, time.monotonic())
-        if change == "start" and self._queue.left:
-            self._assign(self._pool.start())
-        if change in ("stop", "stay"):
-            self._grow = False
-        if change == "stop":
-            self._queue.leave(worker)
-            self._pool.stop(worker)
-            del self._gone_at_start[worker]
-        else:
-            self._assign(worker)
 
 
 def memory_error(frame: int, why: str) -> MissingResourceError:

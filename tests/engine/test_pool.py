@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mitsplat.engine import pool as engine
-from mitsplat.engine import scheduler, worker_processes
+from mitsplat.engine import worker_processes
 from mitsplat.engine.answers import Failure, Finished, FrameError, LostWorkersError, Started
 from mitsplat.engine.frame_queue import FrameQueue
 from mitsplat.engine.pool import run_frames
@@ -127,11 +127,24 @@ def test_a_worker_on_the_cpu_has_two_cores(monkeypatch):
     monkeypatch.setattr(engine, "unused_memory", lambda: 64.0)
     monkeypatch.setattr(engine, "usable_cores", lambda: 2)
     began = []
-    monkeypatch.setattr(engine, "run_pool", lambda *args, **how: began.append((args[2], how)) or (i for i in ()))
+    monkeypatch.setattr(engine, "run_pool", lambda *args: began.append(args[2]) or (i for i in ()))
     monkeypatch.setattr(WorkerProcesses, "start_helper", lambda pool: began.append("helper"))
     for layouts in ({0: range(20)}, {0: range(10), 1: range(10)}):
         list(run_frames(Variant(), layouts, workers=None, note=print, device=CPU, prepare=Prepare(Path())))
-    assert began == [(1, {"grow": True}), "helper"]
+    assert began == [1, "helper"]
+
+
+@pytest.mark.parametrize(("cores", "gigabytes", "workers", "threads"), [(8, 64, 4, 2), (9, 9, 2, 4), (6, 5, 1, 6)])
+def test_automatic_workers_start_at_once_and_share_the_cores(monkeypatch, cores, gigabytes, workers, threads):
+    """A worker takes 4 GiB. Threads that wait for work use CPU time, so that all workers together have one per core."""
+    monkeypatch.setattr(engine, "unused_memory", lambda: float(gigabytes))
+    monkeypatch.setattr(engine, "usable_cores", lambda: cores)
+    monkeypatch.setattr(WorkerProcesses, "start_helper", lambda pool: None)
+    began = []
+    monkeypatch.setattr(engine, "run_pool", lambda *args: began.append((args[2], args[0]._threads)) or (i for i in ()))
+    layouts = {0: range(50), 1: range(50)}
+    list(run_frames(Variant(), layouts, workers=None, note=print, device=CPU, prepare=Prepare(Path())))
+    assert began == [(workers, threads)]
 
 
 @pytest.fixture
@@ -382,9 +395,9 @@ def test_the_number_of_workers_is_bounded_by_gpu_memory(monkeypatch, gigabytes, 
     assert engine.affordable_workers(TYPICAL_MEMORY, device) == count
     began = []
     monkeypatch.setattr(engine, "use_device", began.append)
-    monkeypatch.setattr(engine, "run_pool", lambda *args, **how: began.append((args[2], how)) or (i for i in ()))
+    monkeypatch.setattr(engine, "run_pool", lambda *args: began.append(args[2]) or (i for i in ()))
     list(run_frames(Variant(), {0: range(100)}, workers=None, note=print, device=device))
-    assert began == ([(count, {"grow": False})] if count > 1 else [device])
+    assert began == [count if count > 1 else device]
 
 
 def test_the_number_of_workers_per_gpu_is_bounded(monkeypatch):
@@ -399,7 +412,7 @@ def test_few_frames_on_another_gpu_run_in_one_process(monkeypatch):
     began = []
     monkeypatch.setattr(engine, "affordable_workers", lambda memory, device: 8)
     monkeypatch.setattr(engine, "SharedGpu", None)
-    monkeypatch.setattr(engine, "run_pool", lambda *args, **how: began.append(args[2]) or (i for i in ()))
+    monkeypatch.setattr(engine, "run_pool", lambda *args: began.append(args[2]) or (i for i in ()))
     device = Device("cuda", (Gpu("other", 2**40, 1, "", "GPU-other"),))
     list(run_frames(Variant(), {0: range(12)}, workers=None, note=print, device=device))
     assert began == [1]
@@ -427,67 +440,30 @@ def test_workers_end_with_their_parent(tmp_path):
 
 
 class Scripted:
-    """Pool whose workers take given times on a simulated clock, one after the other, to test the number of workers."""
+    """Pool whose workers finish their frames in turn, and that other machines join."""
 
-    def __init__(self, seconds, joining=(), settle=0.0):
-        self.seconds, self.joining, self.settle, self.clock, self.most = seconds, list(joining), settle, 0.0, 0
-        self.due: dict[int, tuple[float, int]] = {}
-        self.alive: set[int] = set()
-        self.hired = 0
+    def __init__(self, joining):
+        self.joining, self.hired = list(joining), 0
+        self.at_work: dict[int, int] = {}
 
     def start(self):
-        self.alive.add(self.hired)
         self.hired += 1
-        self.most = max(self.most, len(self.alive))
         return self.hired - 1
 
-    def stop(self, worker):
-        self.alive.remove(worker)
-
     def send_frame(self, worker, frame, layout):
-        settle = self.settle * (frame % 8 == 0)
-        self.due[worker] = self.clock + settle + self.seconds(len(self.alive)), frame
+        self.at_work[worker] = frame
 
     def wait(self):
-        worker = min(self.due, key=self.due.__getitem__)
-        self.clock, frame = self.due.pop(worker)
-        yield worker, Finished(frame)
+        worker = next(iter(self.at_work))
+        yield worker, Finished(self.at_work.pop(worker))
 
     def free_slots(self):
         return self.joining.pop(0) if self.joining else 0
 
-    def close(self):
-        pass
-
-
-@pytest.mark.parametrize(
-    ("seconds", "settled_at", "most"),
-    [
-        (lambda count: 1.0, 4, 4),  # every worker adds its full speed
-        (lambda count: float(count), 1, 2),  # all share one core: the second is stopped
-        (lambda count: 1.0 if count <= 2 else 0.6 * count, 2, 3),  # the third adds no speed
-    ],
-)
-def test_workers_are_added_while_they_increase_the_speed(monkeypatch, seconds, settled_at, most):
-    pool = Scripted(seconds)
-    monkeypatch.setattr(scheduler.time, "monotonic", lambda: pool.clock)
-    made = list(run_pool(pool, {0: range(400)}, 4, print, grow=True))
-    assert sorted(made) == list(range(400))
-    assert (len(pool.alive), pool.most) == (settled_at, most)
-
-
-def test_the_time_of_settling_does_not_affect_the_number_of_workers(monkeypatch):
-    """Every eighth frame settles a layout for ten times as long as the others render."""
-    pool = Scripted(lambda count: 1.0, settle=10.0)
-    monkeypatch.setattr(scheduler.time, "monotonic", lambda: pool.clock)
-    made = list(run_pool(pool, {k: range(8 * k, 8 * k + 8) for k in range(40)}, 4, print, grow=True))
-    assert sorted(made) == list(range(320))
-    assert (len(pool.alive), pool.most) == (4, 4)
-
 
 def test_workers_start_on_machines_that_join():
     """No worker starts twice, and none starts without a frame to render."""
-    pool = Scripted(lambda count: 1.0, joining=[0, 0, 2, 0, 0, 50])
+    pool = Scripted(joining=[0, 0, 2, 0, 0, 50])
     assert sorted(run_pool(pool, {0: range(20)}, 1, print)) == list(range(20))
     assert pool.hired == 1 + 2 + 11  # by then 9 of 20 frames were assigned
 

@@ -16,6 +16,7 @@ Float32Array = npt.NDArray[np.float32]
 Float64Array = npt.NDArray[np.float64]
 Int32Array = npt.NDArray[np.int32]
 Int64Array = npt.NDArray[np.int64]
+UInt32Array = npt.NDArray[np.uint32]
 ByteImage = npt.NDArray[np.uint8]
 """Display-encoded RGB image, shape (H, W, 3), unless stated otherwise."""
 AnyArray = npt.NDArray[Any]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -250,7 +250,7 @@ def _host_ids(ids: mi.UInt32, shape: tuple[int, int]) -> npt.NDArray[np.uint16]:
 
 
 def render_silhouettes(
-    integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *, source: str = "splats"
+    integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *, source: Literal["splats", "proxies"] = "splats"
 ) -> dict[int, Silhouette]:
     """Return the unoccluded silhouette of every instance by its id; an instance without pixels is omitted.
 

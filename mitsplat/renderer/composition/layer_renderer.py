@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import reduce
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.images.masks import Silhouette
@@ -20,7 +20,12 @@ from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneCo
 from mitsplat.renderer.composition.shape_state import ShapeState
 from mitsplat.renderer.instances.antialiasing import Edges
 from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
-from mitsplat.renderer.instances.silhouettes import proxy_silhouettes, splat_silhouettes, with_area_beyond
+from mitsplat.renderer.instances.silhouettes import (
+    PlacedMesh,
+    proxy_silhouettes,
+    splat_silhouettes,
+    with_area_beyond,
+)
 from mitsplat.renderer.light.light import light_factor
 from mitsplat.renderer.light.lighting import Accuracy
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
@@ -46,8 +51,8 @@ class LayerRenderer:
     """
 
     quality: Quality
-    shadow: str
-    occluders: str
+    shadow: Literal["traced", "none"]
+    occluders: Literal["proxies", "splats"]
     shadow_error: float
     metered: bool
     shadow_samples: int
@@ -73,8 +78,8 @@ class LayerRenderer:
         views = view_of(sensor).apertures(self.quality.lens_rings)
         accuracy = Accuracy(self.shadow_error, self.shadow_samples, self.metered)
         paths = -(-self.mesh_samples // len(views))
-        layers, errors = self._layers(contents, scene, views[0], accuracy, paths, seed), []
-        errors.append(layers.pop("order_error"))
+        layers = self._layers(contents, scene, views[0], accuracy, paths, seed)
+        errors = [layers.pop("order_error")]
         if len(views) > 1:
             # The mean of n views has sqrt(n) times less noise than each view.
             error, most = self.shadow_error * len(views) ** 0.5, -(-self.shadow_samples // len(views))
@@ -178,7 +183,7 @@ class LayerRenderer:
         view: CameraView,
         layers: dict[str, dr.ArrayBase],
         key: mi.UInt32,
-        radiance: mi.Color3f,
+        radiance: mi.Color3f | None,
         white: mi.Color3f,
     ) -> dict[str, mi.Float | mi.Color3f]:
         """Return colours and opacity with several rays averaged at borders between pixels of different ``key``."""
@@ -267,14 +272,16 @@ class LayerRenderer:
         dr.scatter(radiance, found, pixel)
         return radiance
 
-    def silhouettes(self, scene: mi.Scene, sensor: mi.Sensor, *, source: str = "splats") -> dict[int, Silhouette]:
+    def silhouettes(
+        self, scene: mi.Scene, sensor: mi.Sensor, *, source: Literal["splats", "proxies"] = "splats"
+    ) -> dict[int, Silhouette]:
         """Return the unoccluded silhouette of every instance above 0, by its splats or its proxies (``source``).
 
         Positions are relative to the image and may lie outside it. An instance without pixels is omitted.
         """
         contents = self._contents.read(scene, self.occluders == "splats")
         view = view_of(sensor)
-        proxies: dict[int, list[tuple[trimesh.Trimesh, np.ndarray]]] = {}
+        proxies: dict[int, list[PlacedMesh]] = {}
         for shape in contents.state.shapes:
             if getattr(shape, "instance", 0) and shape.proxy is not None:
                 proxies.setdefault(shape.instance, []).append((shape.proxy, shape.world_from_splats))
@@ -325,6 +332,7 @@ class LayerRenderer:
     def _trace_splats(
         self, contents: SceneContents, scene: mi.Scene, view: CameraView, z_max: mi.Float | None
     ) -> Image:
+        """Render the splats in front of the depths ``z_max`` [m] of meshes and emitters."""
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
         fine = view.sampled(self.quality.rays_per_axis)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +14,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import Quality
 from mitsplat.renderer.instances.antialiasing import trace_tiles
 from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, upload_cloud
-from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, CameraView
+from mitsplat.renderer.rays.camera_rays import TILE_PIXELS, CameraView
 from mitsplat.renderer.rays.tile_subset import TileSubset
 from mitsplat.renderer.splatting.march import Image
 
@@ -47,18 +47,13 @@ class ParameterPass:
 
         Splats behind the depths ``z_max`` along z [m] are not visible.
         """
-        exact = quality if quality.order == "tile" else replace(quality, tolerance=0.0)
-        lane = dr.arange(mi.UInt32, subset.count * TILE_PIXELS)
-        number = dr.gather(mi.UInt32, subset.number, lane // TILE_PIXELS)
-        row = number // view.tiles_x
-        x = (number - row * view.tiles_x) * TILE_WIDTH + lane % TILE_WIDTH
-        y = row * TILE_HEIGHT + lane // TILE_WIDTH % TILE_HEIGHT
+        x, y = subset.positions(view)
         inside = (x < view.width) & (y < view.height)
         pixel = y * view.width + x
         far = None if z_max is None else dr.gather(mi.Float, z_max, pixel, inside)
         dr.eval(far, pixel, inside)
-        own = dr.zeros(mi.Float, dr.width(lane))
-        image, _ = trace_tiles(clouds, placements, view, subset, exact, own, far)
+        own = dr.zeros(mi.Float, subset.count * TILE_PIXELS)
+        image, _ = trace_tiles(clouds, placements, view, subset, quality, own, far)
         return cls(image, pixel, inside)
 
 

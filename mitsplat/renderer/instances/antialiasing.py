@@ -78,7 +78,7 @@ class Edges:
 
     def positions(self) -> tuple[mi.Float, mi.Float]:
         """Return the pixel positions (x, y) of those rays in the finer view [px]."""
-        x, y = self._places()
+        x, y = self.subset.positions(self.fine)
         return mi.Float(x) + 0.5, mi.Float(y) + 0.5
 
     def trace(
@@ -91,17 +91,14 @@ class Edges:
     ) -> tuple[Image, list[mi.Float]]:
         """Render splats along those rays; arguments and result as in `march_tiles`.
 
-        The rays are few, so that the order per ray replaces every order with a finite tolerance.
-
         Raises:
             CrowdedError: If one tile alone has too many pairs.
         """
-        exact = quality if quality.order == "tile" else replace(quality, tolerance=0.0)
-        return trace_tiles(clouds, placements, self.fine, self.subset, exact, mi.Float(own), z_max)
+        return trace_tiles(clouds, placements, self.fine, self.subset, quality, mi.Float(own), z_max)
 
     def pixels(self) -> mi.UInt32:
         """Return the pixel of the picture that contains each ray."""
-        x, y = self._places()
+        x, y = self.subset.positions(self.fine)
         return _pixel(mi.Int32(x // self.zoom), mi.Int32(y // self.zoom), self.view)
 
     def nearest_other(self, keys: mi.UInt32, own: mi.UInt32) -> mi.UInt32:
@@ -113,7 +110,7 @@ class Edges:
             keys: Keys of the picture's pixels.
             own: Keys of the rays.
         """
-        x, y = self._places()
+        x, y = self.subset.positions(self.fine)
         px, py = mi.Int32(x // self.zoom), mi.Int32(y // self.zoom)
         # Direction of the nearer neighbour along each axis.
         right, down = (dr.select(place % self.zoom * 2 >= self.zoom, mi.Int32(1), -1) for place in (x, y))
@@ -144,14 +141,6 @@ class Edges:
         dr.scatter(result, total / self.zoom**2, y * self.view.width + x, inside, mode=dr.ReduceMode.Permute)
         return result
 
-    def _places(self) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return column and row of the finer view's pixels."""
-        lane = dr.arange(mi.UInt32, self.subset.count * TILE_PIXELS)
-        number = dr.gather(mi.UInt32, self.subset.number, lane // TILE_PIXELS)
-        row = number // self.fine.tiles_x
-        x = (number - row * self.fine.tiles_x) * TILE_WIDTH + lane % TILE_WIDTH
-        return x, row * TILE_HEIGHT + lane // TILE_WIDTH % TILE_HEIGHT
-
 
 def _pixel(x: mi.Int32, y: mi.Int32, view: CameraView) -> mi.UInt32:
     """Return the number of a pixel, clamped to the image."""
@@ -169,9 +158,13 @@ def trace_tiles(
 ) -> tuple[Image, list[mi.Float]]:
     """Render the tiles of ``subset``, in parts if they have too many pairs; see :func:`march_tiles`.
 
+    The tiles are few, so that the order per ray replaces every order with a finite tolerance.
+
     Raises:
         CrowdedError: If one tile alone has too many pairs.
     """
+    if quality.order != "tile":
+        quality = replace(quality, tolerance=0.0)
     try:
         return march_tiles(bin_gaussians(clouds, placements, view, quality, subset=subset), view, quality, own, z_max)
     except CrowdedError:

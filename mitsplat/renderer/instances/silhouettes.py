@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.arrays import Float64Array, Int64Array, UInt32Array
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.lens import FISHEYE_MAX, Lens, lens_fault
 from mitsplat.images.masks import Silhouette
@@ -40,6 +41,9 @@ distortion cannot be inverted that far out, the largest margin with an inverse i
 _ROWS_OF_COLUMN = (np.arange(1 << TILE_HEIGHT)[:, None] >> np.arange(TILE_HEIGHT) & 1).astype(bool)
 """Pixels of a tile column, from the top, that the bits of a number cover."""
 
+PlacedMesh = tuple[trimesh.Trimesh, Float64Array]
+"""Mesh, and its pose ``world_from_mesh``, shape (4, 4)."""
+
 _MAX_SLOPE = math.tan(FISHEYE_MAX)
 _SAMPLES_BEYOND = 512
 """Range of slopes in which silhouettes beyond the canvas are sampled, and number of samples along each axis."""
@@ -60,8 +64,8 @@ def splat_silhouettes(
 
 
 def _cover(
-    clouds: CloudSet, objects: Sequence[Placement], canvas: CameraView, quality: Quality, ids: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    clouds: CloudSet, objects: Sequence[Placement], canvas: CameraView, quality: Quality, ids: Int64Array
+) -> tuple[UInt32Array, UInt32Array, UInt32Array]:
     """Return tile, instance (as position in ``ids``) and covered pixels of every run, see :func:`_covered`.
 
     A canvas with too many pairs for the memory is processed in parts.
@@ -88,9 +92,7 @@ def _cover(
     return np.array(tile), np.array(runs.slot), np.array(_covered(lists, canvas, quality, runs))
 
 
-def proxy_silhouettes(
-    proxies: Mapping[int, Sequence[tuple[trimesh.Trimesh, np.ndarray]]], view: CameraView
-) -> dict[int, Silhouette]:
+def proxy_silhouettes(proxies: Mapping[int, Sequence[PlacedMesh]], view: CameraView) -> dict[int, Silhouette]:
     """Return the silhouettes of instances from proxy meshes.
 
     ``proxies`` holds (mesh, world_from_mesh) of every part of an instance, by instance id.
@@ -113,7 +115,7 @@ def proxy_silhouettes(
 
 def with_area_beyond(
     found: Mapping[int, Silhouette],
-    proxies: Mapping[int, Sequence[tuple[trimesh.Trimesh, np.ndarray]]],
+    proxies: Mapping[int, Sequence[PlacedMesh]],
     view: CameraView,
 ) -> dict[int, Silhouette]:
     """Return silhouettes with the area of their proxies beyond the canvas, where they reach it and the image."""
@@ -127,7 +129,7 @@ def with_area_beyond(
     return result
 
 
-def _area_beyond(canvas: CameraView, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> float:
+def _area_beyond(canvas: CameraView, parts: Sequence[PlacedMesh]) -> float:
     """Return the area that meshes cover outside of a canvas [px], up to 85 degrees beside the optical axis.
 
     The area is sampled in the plane of slopes, in which pixels have their size at the centre of the lens.
@@ -258,7 +260,13 @@ def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) 
 
 
 def _assemble(
-    tile: np.ndarray, slot: np.ndarray, bits: np.ndarray, ids: np.ndarray, canvas: CameraView, left: int, top: int
+    tile: UInt32Array,
+    slot: UInt32Array,
+    bits: UInt32Array,
+    ids: Int64Array,
+    canvas: CameraView,
+    left: int,
+    top: int,
 ) -> dict[int, Silhouette]:
     """Assemble the masks of instances from those of their tiles."""
     columns = bits.astype(np.uint8).reshape(len(tile), TILE_WIDTH)
@@ -283,7 +291,7 @@ def _assemble(
     return found
 
 
-def _window(view: CameraView, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]]) -> tuple[int, int, int, int] | None:
+def _window(view: CameraView, parts: Sequence[PlacedMesh]) -> tuple[int, int, int, int] | None:
     """Return the box of canvas pixels that meshes may cover, or None."""
     camera = view.camera
     points = np.concatenate([trimesh.transform_points(mesh.vertices, pose) for mesh, pose in parts])
@@ -296,7 +304,7 @@ def _window(view: CameraView, parts: Sequence[tuple[trimesh.Trimesh, np.ndarray]
 
 
 def _trace_alone(
-    view: CameraView, window: tuple[int, int, int, int], mesh: trimesh.Trimesh, pose: np.ndarray
+    view: CameraView, window: tuple[int, int, int, int], mesh: trimesh.Trimesh, pose: Float64Array
 ) -> mi.Bool:
     """Return True for the pixels of a window whose rays hit a mesh."""
     x0, y0, x1, y1 = window

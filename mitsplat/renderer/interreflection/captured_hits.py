@@ -11,7 +11,14 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.emitters.emitter_sampling import ROUGH_LATTICE, Emitters, receiver
-from mitsplat.renderer.interreflection.ray_paths import Paths, end_kernel, occluded, sequence_number, shadow_ray
+from mitsplat.renderer.interreflection.ray_paths import (
+    Paths,
+    end_kernel,
+    next_key,
+    occluded,
+    sequence_number,
+    shadow_ray,
+)
 from mitsplat.renderer.materials.radiance_grid import RadianceGrid
 from mitsplat.renderer.occluders.proxies import Boxes, Proxies, TraceScene
 
@@ -135,6 +142,6 @@ class CapturedHits:
         irradiance = self.emitters.unoccluded_irradiance(receiver(ray.o, normal), free, ROUGH_LATTICE)
         albedo = dr.minimum(captured * self.white / dr.maximum(irradiance, 1e-20), 1)
         spread = dr.opaque(mi.Float, CAPTURED_SPREAD, dr.width(key))
-        paths = Paths(ray, near, key * 0x9E3779B1 + 0x85EBCA77, emitter_sample, spread, dr.select(free, albedo, 0))
+        paths = Paths(ray, near, next_key(key), emitter_sample, spread, dr.select(free, albedo, 0))
         dr.eval(lane, paths)
         return lane, paths

@@ -90,6 +90,11 @@ def shadow_ray(origin: mi.Point3f, direction: mi.Vector3f, reach: mi.Float) -> m
     return ray
 
 
+def next_key(key: mi.UInt32) -> mi.UInt32:
+    """Return keys for the rays that continue paths, with other random numbers than those of ``key``."""
+    return key * 0x9E3779B1 + 0x85EBCA77
+
+
 def sequence_number(key: mi.UInt32, dimension: int) -> mi.Float:
     """Return a number in [0, 1) per key: a coordinate of :data:`RICHTMYER`."""
     return mi.Float((key * RICHTMYER[dimension]) >> 8) * 2.0**-24

@@ -19,6 +19,7 @@ from mitsplat.renderer.interreflection.ray_paths import (
     Paths,
     end_kernel,
     lifted,
+    next_key,
     occluded,
     place_on,
     sequence_number,
@@ -129,8 +130,8 @@ class Reflectors:
             number = dr.gather(mi.UInt32, start, row) + (lane - row * some + dr.opaque(mi.UInt32, first)) * step
             upward, emitter_sample = sequence(number)
             frame = mi.Frame3f(dr.gather(mi.Vector3f, normal, row))
-            towards = frame.to_world(mi.warp.square_to_cosine_hemisphere(upward))
-            ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), towards)
+            direction = frame.to_world(mi.warp.square_to_cosine_hemisphere(upward))
+            ray = mi.Ray3f(dr.gather(mi.Point3f, origin, row), direction)
             dr.eval(ray, number, emitter_sample)
             spread = dr.opaque(mi.Float, DIFFUSE_SPREAD, count * some)
             colour, captured, distance = self._trace(ray, number, emitter_sample, spread, BOUNCES)
@@ -272,7 +273,7 @@ class Reflectors:
             return lit
         some = (dr.gather(type(v), v, lane) for v in (onward, key, other, normal, density, spread))
         onward, key, other, normal, density, spread = some
-        key = key * 0x9E3779B1 + 0x85EBCA77  # other random numbers
+        key = next_key(key)
         dr.eval(onward, key, other, normal, density, spread)
         colour, _, onward.maxt = self._trace(onward, key, other, spread, bounces)
         if lobe is not None:

@@ -1,4 +1,4 @@
-"""Tolerated standard error of light at any level, and automatic exposure."""
+"""Standard errors of light, estimated and tolerated, and automatic exposure."""
 
 from __future__ import annotations
 
@@ -26,6 +26,15 @@ def allowed_error(error: float, light: mi.Float) -> mi.Float:
     It follows the slope of the display curve.
     """
     return error * dr.power(dr.clip(light, MIN_LIGHT, 1) / MID_GREY, 1 - DISPLAY)
+
+
+def share_variance(share: mi.Float, draws: mi.Float) -> mi.Float:
+    """Return the variance of a light share that a number of binary ``draws`` has estimated.
+
+    Half a draw of each outcome is added (Jeffreys), so that a few equal draws do not count as certain.
+    """
+    likely = (share * draws + 0.5) / (draws + 1)
+    return likely * (1 - likely) / draws
 
 
 def metered_exposure(light: mi.Float, area: mi.Int32, others: mi.UInt32) -> mi.Float:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.error_target import allowed_error, metered_exposure
+from mitsplat.renderer.light.error_target import allowed_error, metered_exposure, share_variance
 from mitsplat.renderer.light.light_estimate import Estimate, LightMeans
 from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.rays.camera_rays import CameraView
@@ -238,8 +238,7 @@ class LightFilter:
         (lit, base, squares), shared = self._average(values, estimate.rays, 1)
         share = dr.select(base > 0, lit / base, 1)
         draws = dr.maximum(shared * estimate.rays * dr.square(base) / dr.maximum(squares, 1e-20), 1)
-        likely = (share * draws + 0.5) / (draws + 1)
-        variance = likely * (1 - likely) / draws
+        variance = share_variance(share, draws)
         dr.eval(share, variance)
         return share, variance, shared
 

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsplat.renderer.emitters.emitter_sampling import Emitters
+from mitsplat.renderer.light.error_target import share_variance
 from mitsplat.renderer.light.light_estimate import Estimate
 from mitsplat.renderer.light.light_tiles import BLOCK
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
@@ -141,8 +142,7 @@ class Planes:
         _, lit, base, squares = dr.while_loop(state, lambda i, *_: i < rounds, add, label="planes' light")
         draws = dr.maximum(dr.square(base) / dr.maximum(squares, 1e-20), 1)
         share = dr.select(base > 0, lit / base, 1)
-        likely = (share * draws + 0.5) / (draws + 1)
-        variance = likely * (1 - likely) / draws
+        variance = share_variance(share, draws)
         dr.eval(share, variance)
         even = mi.Bool(True)
         for neighbour in self._neighbours():

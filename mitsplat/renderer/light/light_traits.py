@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +13,30 @@ import numpy as np
 from mitsplat.gaussians.splat_materials import specular_of
 from mitsplat.renderer.projection.clouds import Placement
 from mitsplat.renderer.rays.device_arrays import wrapped
+
+
+class _Row(NamedTuple):
+    """Light parameters of a shape, see :class:`Traits`."""
+
+    relit: bool
+    roughness: float
+    metallic: float
+    specular: float
+    captured: bool
+
+    @classmethod
+    def of(cls, shape: mi.Shape) -> _Row:
+        """Return the parameters of a ``splats`` shape; means over its materials if it has any."""
+        materials, gloss = shape.splats.materials, shape.gloss
+        if materials is None:
+            return cls(shape.capture_light == "uniform", shape.roughness, 0.0, specular_of(shape.specular), True)
+        return cls(
+            relit=True,
+            roughness=float(materials.roughness.mean()) if gloss.roughness is None else gloss.roughness,
+            metallic=float(materials.metallic.mean()),
+            specular=float(materials.specular.mean()) if gloss.specular is None else gloss.specular,
+            captured=False,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +69,14 @@ class Traits:
         """Build the table from ``splats`` shapes and their placements."""
         count = 1 + max([0, *(s.instance for s in shapes)])
         # Without captured surroundings, pixels of instance 0 show sparse splats of objects, which are relit.
-        plain = True, 0.4, 0.0, 0.0, True
-        rows: dict[tuple[int, Any], int] = {}
+        plain = _Row(relit=True, roughness=0.4, metallic=0.0, specular=0.0, captured=True)
+        rows: dict[tuple[int, _Row], int] = {}
         values, owners, placed = [plain] * count, list(range(count)), [p.instance for p in placements]
         # A pixel never shows a shape without splats.
         order = [i for i in range(len(shapes)) if len(shapes[i].splats)]
         for i in sorted(order, key=lambda i: -len(shapes[i].splats)):
             shape = shapes[i]
-            own = _parameters(shape)
+            own = _Row.of(shape)
             key = shape.instance, own
             if key not in rows:
                 first = not any(instance == shape.instance for instance, _ in rows)
@@ -77,16 +101,3 @@ class Traits:
         if row is None:
             return instance
         return dr.select(dr.gather(mi.UInt32, self.owner, row) == instance, row, instance)
-
-
-def _parameters(shape: mi.Shape) -> tuple[bool, float, float, float, bool]:
-    """Return relit, roughness, metallic, specular and captured of a ``splats`` shape."""
-    materials = shape.splats.materials
-    if materials is None:
-        return shape.capture_light == "uniform", shape.roughness, 0.0, specular_of(shape.specular), True
-    roughness, metallic, specular = (
-        float(values.mean()) for values in (materials.roughness, materials.metallic, materials.specular)
-    )
-    roughness = roughness if shape.gloss.roughness is None else shape.gloss.roughness
-    specular = specular if shape.gloss.specular is None else shape.gloss.specular
-    return True, roughness, metallic, specular, False

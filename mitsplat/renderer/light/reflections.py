@@ -18,7 +18,7 @@ from mitsplat.renderer.interreflection.reflectors import LANES, Reflectors
 from mitsplat.renderer.light.light_filter import Guide, LightFilter, packed
 from mitsplat.renderer.light.shadow_rays import ROBERTS, ShadowTracer, ray_origin, sequence_point
 from mitsplat.renderer.materials.principled import power_weight, typical_brightness
-from mitsplat.renderer.rays.device_arrays import concatenated, gathered
+from mitsplat.renderer.rays.device_arrays import concatenated, gathered, opaque_seed
 
 RAY_STEP, COLUMN_STEP, ROW_STEP = 3484022021, 2665396185, 3590773907
 """Steps in Roberts' sequence to the next ray of a pixel, to the pixel on its right, and to the pixel below.
@@ -126,9 +126,8 @@ class ReflectionTracer:
 
     def _sequence_start(self, pixel: mi.UInt32) -> mi.UInt32:
         """Return the number of the first point of pixels in Roberts' sequence."""
-        start = dr.opaque(mi.UInt32, self.tracer.seed * 2654435761 % (1 << 32))
         width = self.tracer.view.width
-        return start + pixel % width * COLUMN_STEP + pixel // width * ROW_STEP
+        return opaque_seed(self.tracer.seed) + pixel % width * COLUMN_STEP + pixel // width * ROW_STEP
 
     def _light(self, places: mi.UInt32, number: mi.UInt32) -> tuple[mi.Color3f, mi.Color3f]:
         """Return the tinted and the colourless light of one ray per lane; each scene has a kernel of its own."""

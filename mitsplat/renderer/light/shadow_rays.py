@@ -16,7 +16,7 @@ from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.materials.principled import power_weight, typical_brightness
 from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.rays.device_arrays import gathered
+from mitsplat.renderer.rays.device_arrays import gathered, opaque_seed
 
 ROBERTS = (3242174889, 2447445414)
 """Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
@@ -142,7 +142,7 @@ class ShadowTracer:
 
     def start_at(self, x: mi.UInt32, y: mi.UInt32) -> mi.UInt32:
         """Return the number of the first point of the elements of a grid: neighbours take distant points."""
-        return dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32)) + _bayer(x, y)
+        return opaque_seed(self.seed) + _bayer(x, y)
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,7 +45,7 @@ class RadianceGrid:
     cells: mi.Point3i
 
     @classmethod
-    def build(cls, splats: Splats, world_from_splats: np.ndarray) -> RadianceGrid | None:
+    def build(cls, splats: Splats, world_from_splats: Float64Array) -> RadianceGrid | None:
         """Build the grid from the splats with opacity above 0.5; return None if there are none."""
         opaque = splats.opacities > 0.5
         if not opaque.any():

@@ -19,7 +19,7 @@ from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes, has_bsdf_flag
 from mitsplat.renderer.occluders.proxies import Proxies
 from mitsplat.renderer.projection.gaussian import srgb_to_linear
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.rays.device_arrays import gathered
+from mitsplat.renderer.rays.device_arrays import gathered, opaque_seed
 
 LANES = 1 << 20
 """Number of paths that are traced at once."""
@@ -87,8 +87,7 @@ class PathTracer:
         hit a mesh too.
         """
         count = dr.width(pixel)
-        # The factor separates the seeds, so that no two pictures share random numbers.
-        seed = dr.opaque(mi.UInt32, self.seed * 2654435761 % (1 << 32))
+        seed = opaque_seed(self.seed)
         most = max(1, min(samples, LANES // count))
         total, done = mi.Color3f(dr.zeros(mi.Float, count)), 0
         while done < samples:

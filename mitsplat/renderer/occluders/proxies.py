@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.arrays import Float64Array
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
 from mitsplat.renderer.materials.proxy_materials import (
@@ -59,7 +60,7 @@ class Occluder:
     mesh: trimesh.Trimesh
     instance: int
     dynamic: bool
-    world_from_mesh: np.ndarray = field(default_factory=lambda: np.eye(4))
+    world_from_mesh: Float64Array = field(default_factory=lambda: np.eye(4))
     splats: Splats | None = None
     appearance: SplatAppearance | None = None
     gloss: GlossChange = UNCHANGED_GLOSS
@@ -201,9 +202,9 @@ class Proxies:
 
     def nearest(self, ray: mi.Ray3f) -> tuple[Hit, Hit]:
         """Return the first hits of rays, and the first hits without the dynamic proxies."""
-        static = TraceScene.nearest(self.static, ray, Hit.miss())
+        static = Hit.miss() if self.static is None else self.static.nearest(ray, Hit.miss())
         dr.eval(static)  # a separate kernel, see `separate_kernels`
-        return TraceScene.nearest(self.dynamic, ray, static), static
+        return static if self.dynamic is None else self.dynamic.nearest(ray, static), static
 
     def blocked(self, ray: mi.Ray3f) -> mi.Bool:
         """Return True for rays that hit a proxy before their end."""
@@ -235,10 +236,8 @@ class TraceScene:
     normals: mi.Float
     materials: CornerMaterials | None
 
-    def nearest(self: TraceScene | None, ray: mi.Ray3f, other: Hit) -> Hit:
+    def nearest(self, ray: mi.Ray3f, other: Hit) -> Hit:
         """Return the nearer of ``other`` and the hits in this scene."""
-        if self is None:
-            return other
         si = self.scene.ray_intersect(ray, mi.RayFlags.UV, coherent=True)
         closer = si.t < other.distance
         proxy = closer & (si.shape == self.mesh) if self.mesh is not None else mi.Bool(False)
@@ -367,7 +366,7 @@ def _merged_scene(parts: tuple[ProxyPart, ...], others: Mapping[str, mi.Shape]) 
     )
 
 
-def world_corners(part: ProxyPart) -> tuple[np.ndarray, np.ndarray]:
+def world_corners(part: ProxyPart) -> tuple[Float64Array, Float64Array]:
     """Return corners [m] and unit normals (3 T, 3) of the triangles of a placement in world space."""
     world_from_mesh = np.frombuffer(part.pose).reshape(4, 4)
     turn, shift = world_from_mesh[:3, :3], world_from_mesh[:3, 3]
@@ -376,7 +375,7 @@ def world_corners(part: ProxyPart) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=64)
-def _own_corners(mesh: trimesh.Trimesh, splats: Splats | None) -> tuple[np.ndarray, np.ndarray]:
+def _own_corners(mesh: trimesh.Trimesh, splats: Splats | None) -> tuple[Float64Array, Float64Array]:
     """Return corners and normals (3 T, 3) of the triangles in the frame of the mesh, cached across layouts."""
     own = [mesh.triangles, smooth_normals(mesh).reshape(-1, 3, 3)]
     divided = material_triangles(mesh, splats)
@@ -387,8 +386,8 @@ def _own_corners(mesh: trimesh.Trimesh, splats: Splats | None) -> tuple[np.ndarr
 
 
 @lru_cache(maxsize=64)
-def smooth_normals(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return corner normals, cached across layouts.
+def smooth_normals(mesh: trimesh.Trimesh) -> Float64Array:
+    """Return corner normals (3 T, 3), cached across layouts.
 
     Reconstructed surfaces are rough everywhere, so that an angle that is a crease in a CAD mesh is noise in them. An
     edge is therefore a crease only if it is much sharper than the flattest quarter of all edges, by length.

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.arrays import AnyArray, Float64Array
 from mitsplat.renderer.projection.records import Geometry, PlacementRow
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance, appearance_rows
 from mitsplat.renderer.rays.camera_rays import CameraView
@@ -41,9 +42,7 @@ class Cloud:
     sh_stride: int
 
 
-def upload_cloud(
-    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
-) -> Cloud:
+def upload_cloud(means: AnyArray, quats: AnyArray, scales: AnyArray, opacities: AnyArray, sh: AnyArray) -> Cloud:
     """Copy N Gaussians to the device, with scales of at least :data:`SCALE_RATIO_MIN` of the largest one.
 
     Args:
@@ -81,7 +80,7 @@ class Placement:
     """
 
     cloud: int
-    world_from_cloud: np.ndarray
+    world_from_cloud: Float64Array
     instance: int
     appearance: SplatAppearance | None = None
 

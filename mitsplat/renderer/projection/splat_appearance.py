@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.arrays import Float32Array
 from mitsplat.renderer.projection.gaussian import linear_to_srgb, srgb_to_linear
 from mitsplat.renderer.projection.records import AppearanceRow
 
@@ -55,7 +56,7 @@ class SplatAppearance:
         return [1.0, *self.matrix, self.wear, float(self.seed), CELLS / self.size]
 
 
-def appearance_rows(appearances: list[SplatAppearance | None]) -> np.ndarray:
+def appearance_rows(appearances: list[SplatAppearance | None]) -> Float32Array:
     """Return one :class:`AppearanceRow` per appearance; zeros where it is None."""
     nothing = [0.0] * AppearanceRow.WIDTH
     return np.array([nothing if one is None else one.row for one in appearances], np.float32).reshape(

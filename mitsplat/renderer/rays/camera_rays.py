@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsplat.arrays import Float64Array
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.lens import FISHEYE_MAX, NEWTON_STEPS, Lens, fisheye_radius, fisheye_rate, opencv_distort, padded
 
@@ -52,7 +52,7 @@ class CameraView:
     fy: float
     cx: float
     cy: float
-    world_from_camera: np.ndarray
+    world_from_camera: Float64Array
     distortion: tuple[float, ...] = ()
     near: float = 0.01
     samples: int = 1
@@ -123,8 +123,16 @@ class CameraView:
 
     def finer(self, zoom: int) -> CameraView:
         """Return the same view with each pixel divided into ``zoom`` x ``zoom`` pixels."""
-        numbers: dict[str, Any] = {n: zoom * getattr(self, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
-        return replace(self, zoom=zoom * self.zoom, **numbers)
+        return replace(
+            self,
+            width=zoom * self.width,
+            height=zoom * self.height,
+            fx=zoom * self.fx,
+            fy=zoom * self.fy,
+            cx=zoom * self.cx,
+            cy=zoom * self.cy,
+            zoom=zoom * self.zoom,
+        )
 
     @property
     def camera(self) -> Camera:

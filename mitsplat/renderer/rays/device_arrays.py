@@ -11,8 +11,10 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
+from mitsplat.arrays import AnyArray, Float64Array
 
-def wrapped(kind: type, values: np.ndarray) -> dr.ArrayBase:
+
+def wrapped(kind: type, values: AnyArray) -> dr.ArrayBase:
     """Return a device array of type ``kind`` on a copy of ``values`` that starts at a cache line.
 
     Dr.Jit compiles different kernels for unaligned memory, and the alignment of NumPy's memory is random.
@@ -45,6 +47,11 @@ def on_device(*numbers: float) -> mi.Float:
     return wrapped(mi.Float, np.array(numbers, dtype=np.float32))
 
 
+def opaque_seed(seed: int) -> mi.UInt32:
+    """Return a seed as an opaque number, far from the numbers of adjacent seeds, whose pictures share no ray."""
+    return dr.opaque(mi.UInt32, seed * 2654435761 % (1 << 32))
+
+
 def number(values: mi.Float, place: int) -> mi.Float:
     """Return one of the numbers of :func:`on_device`."""
     return dr.gather(mi.Float, values, place)
@@ -59,7 +66,7 @@ def gathered(columns: Columns, index: mi.UInt32) -> Columns:
     return type(columns)(*[v if dr.width(v) == 1 else dr.gather(type(v), v, index) for v in values])
 
 
-def segments(starts: np.ndarray, ends: np.ndarray) -> mi.Ray3f:
+def segments(starts: Float64Array, ends: Float64Array) -> mi.Ray3f:
     """Return rays with unit directions that end at the end points; points [m] have shape (N, 3)."""
     way = ends - starts
     length = np.linalg.norm(way, axis=1)

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.renderer.rays.camera_rays import CameraView
+from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, CameraView
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +57,14 @@ class TileSubset:
         dr.scatter(before, dr.opaque(mi.UInt32, dr.width(number)), dr.opaque(mi.UInt32, dr.width(flags)))
         dr.eval(number, before, above)
         return cls(number, dr.width(number), before, above, columns)
+
+    def positions(self, view: CameraView) -> tuple[mi.UInt32, mi.UInt32]:
+        """Return column and row of every pixel, tile after tile; those at the border may lie outside the image."""
+        lane = dr.arange(mi.UInt32, self.count * TILE_PIXELS)
+        number = dr.gather(mi.UInt32, self.number, lane // TILE_PIXELS)
+        row = number // view.tiles_x
+        x = (number - row * view.tiles_x) * TILE_WIDTH + lane % TILE_WIDTH
+        return x, row * TILE_HEIGHT + lane // TILE_WIDTH % TILE_HEIGHT
 
     def halves(self, view: CameraView) -> tuple[TileSubset, TileSubset]:
         """Split the subset into its first and second half."""

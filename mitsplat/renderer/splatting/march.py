@@ -8,10 +8,9 @@ tolerance are walked in the order of each ray.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 from operator import or_
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -86,20 +85,14 @@ class Image:
         for pixel, inside in zip(lanes.pixel, lanes.inside, strict=True):
             dr.scatter(changed, mi.Bool(True), pixel, inside)
         dr.eval(changed, part)
-        values: dict[str, Any] = {
-            f.name: _select(changed, getattr(part, f.name), getattr(self, f.name)) for f in fields(Image)
-        }
-        return Image(**values)
-
-
-def _select(
-    changed: mi.Bool, new: list[mi.Float] | dr.ArrayBase | None, old: list[mi.Float] | dr.ArrayBase | None
-) -> list[mi.Float] | dr.ArrayBase | None:
-    if new is None or old is None:
-        return None
-    if isinstance(new, list):
-        return [dr.select(changed, a, b) for a, b in zip(new, old, strict=True)]
-    return dr.select(changed, new, old)
+        return Image(
+            rgb=[dr.select(changed, new, old) for new, old in zip(part.rgb, self.rgb, strict=True)],
+            alpha=dr.select(changed, part.alpha, self.alpha),
+            depth=dr.select(changed, part.depth, self.depth),
+            instance=dr.select(changed, part.instance, self.instance),
+            centre_alpha=dr.select(changed, part.centre_alpha, self.centre_alpha),
+            error=None if part.error is None or self.error is None else dr.select(changed, part.error, self.error),
+        )
 
 
 def largest_and_mean(error: mi.Float) -> tuple[mi.Float, mi.Float]:

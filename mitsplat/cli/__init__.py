@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from mitsplat.cli import assets, datasets, detectors, fault, inspection, lights, machine, photographs
+from mitsplat.cli import assets, captures, datasets, detectors, exports, fault, inspection, lights, machine, photographs
 from mitsplat.cli.interrupt import handle_interrupts
 from mitsplat.cli.options import parse_strictly
 from mitsplat.errors import LateDeviceError, exit_status, sentence_of
@@ -32,10 +32,10 @@ from mitsplat.version import __version__
 COMMAND_GROUPS: Mapping[str, Sequence[Callable[..., None]]] = {
     "Make assets": (
         photographs.asset,
-        photographs.capture,
+        captures.capture,
         photographs.fit,
         photographs.mesh,
-        photographs.board,
+        captures.board,
         assets.bake,
         assets.import_,
         lights.lights,
@@ -45,7 +45,7 @@ COMMAND_GROUPS: Mapping[str, Sequence[Callable[..., None]]] = {
         datasets.settle,
         datasets.merge,
         datasets.split,
-        datasets.export,
+        exports.export,
     ),
     "Inspect": (
         inspection.view,

@@ -30,6 +30,7 @@ from mitsplat.cli.options import (
 from mitsplat.errors import InputError
 
 if TYPE_CHECKING:
+    from mitsplat.bake.bake import BakeResult
     from mitsplat.importing.import_result import Imported
     from mitsplat.mesh_files.mesh_file import MeshFile
 
@@ -104,7 +105,6 @@ def bake(
     """
     from mitsplat.bake.bake import BakeSettings, bake_asset
     from mitsplat.bake.bake_report import write_bake_report
-    from mitsplat.bake.size_checks import describe_size
     from mitsplat.bake.surface_materials import SurfaceFinish
 
     _check_folder(out, mesh, name, overwrite=overwrite)
@@ -137,14 +137,7 @@ def bake(
                 progress=progress,
             )
         result.asset.save(folder)
-        report = write_bake_report(folder, result)
-        for warning in result.warnings:
-            typer.echo(f"warning: {warning}")
-        typer.echo(f"units of the mesh: {result.units}")
-        if result.asset.mesh is not None:
-            typer.echo(f"size: {describe_size(result.asset.mesh)}")
-        typer.echo(f"report: {report}")
-        typer.echo(f"asset: {folder} ({len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB on unseen views)")
+        _print_bake(folder, result, write_bake_report(folder, result))
 
 
 def _bake_sources(mesh: Path, out: Path, *, tolerance: float | None, split: bool) -> Mapping[Path, MeshFile | Path]:
@@ -163,6 +156,25 @@ def _bake_sources(mesh: Path, out: Path, *, tolerance: float | None, split: bool
     for part, (_, count) in parts.items():
         typer.echo(f"part: {part} ({count} of {len(file.parts)} parts)")
     return {out / part: content for part, (content, _) in parts.items()}
+
+
+def _print_bake(folder: Path, result: BakeResult, report: Path) -> None:
+    """Print the properties of a baked asset and warnings."""
+    from mitsplat.bake.size_checks import describe_size
+
+    for warning in result.warnings:
+        typer.echo(f"warning: {warning}")
+    typer.echo(f"units of the mesh: {result.units}")
+    if result.asset.mesh is not None:
+        typer.echo(f"size: {describe_size(result.asset.mesh)}")
+    typer.echo(f"report: {report}")
+    typer.echo(f"asset: {folder} ({len(result.asset.splats)} Gaussians, {result.psnr:.1f} dB on unseen views)")
+
+
+_FIXED_BY_COLLIDERS = frozenset(
+    ("--up", "--size", "--units", "--crop", "--without-table", "--flat-base", "--scene", "--metallic", "--roughness")
+)
+"""Options of ``import`` without effect on a USD stage with colliders."""
 
 
 def import_(
@@ -241,9 +253,8 @@ def import_(
 
         stage = read_stage_asset(file)
         if stage.asset is not None:
-            fixed = {"--up", "--size", "--units", "--crop", "--without-table", "--flat-base", "--scene"}
-            fixed |= {"--metallic", "--roughness"}
-            refuse_options(given_options(context) & fixed, f"{file}, whose colliders state its geometry")
+            ineffective = given_options(context) & _FIXED_BY_COLLIDERS
+            refuse_options(ineffective, f"{file}, whose colliders state its geometry")
             asset = with_values(
                 stage.asset, name, class_name, mass=mass, density=density, friction=friction, light=light
             )

@@ -1,11 +1,11 @@
-"""Commands that make datasets and export scenes.
+"""Commands that make datasets.
 
 Each command imports its dependencies inside its function, so that all other commands and ``--help`` start fast.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,14 +16,12 @@ from mitsplat.cli.console import command_log, format_counts, print_device
 from mitsplat.cli.options import (
     AllowOutside,
     DatasetFolder,
-    FrameIndex,
     FrameSize,
     JsonLog,
     OverwriteDataset,
     Preset,
     SceneFile,
     SceneSeed,
-    check_new,
     check_output_file,
     given_options,
     refuse_options,
@@ -36,6 +34,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from mitsplat.dataset.write import DatasetSummary
+    from mitsplat.engine.ray import Cluster
     from mitsplat.progress import Progress
     from mitsplat.runtime.device import Device
     from mitsplat.scene.scene import Scene
@@ -127,13 +126,8 @@ def render(
     from mitsplat.runtime.device import find_device
     from mitsplat.usd.usd_layers import is_usd
 
-    given = given_options(context) - {"--out", "--device", "--json", "--allow-outside"}
     with command_log(json_log, "render") as progress_bars:
-        if only is not None:
-            one = given & {"--frames", "--shard", "--engine", "--workers", "--overwrite"}
-            refuse_options(one, "--only, which renders one image on this machine")
-        if engine != "ray":
-            refuse_options(given & {"--address", "--resources"}, "this machine: add --engine ray for a Ray cluster")
+        _refuse_ineffective(given_options(context), scene, only=only, engine=engine)
         overrides = scene_overrides(size=size, seed=seed, quality=quality, formats=formats)
         if out is None:
             out = Path("out") / (scene.stem if shard is None else f"{scene.stem}-{shard.replace('/', '-of-')}")
@@ -141,27 +135,19 @@ def render(
         if chosen is not None and not json_log:
             print_device(chosen)
         if scene.suffix == ".xml":
-            refuse_options(given, f"the Mitsuba scene {scene}, which has its own size, seed and quality")
             from mitsplat.frames.mitsuba_xml import render_apart
 
             typer.echo(f"picture: {render_apart(scene, out, allow_outside=allow_outside, device=chosen)}")
             return
         if is_usd(scene):
-            refuse_options(
-                given - {"--frames", "--size", "--format", "--quality", "--overwrite"}, f"the USD stage {scene}"
-            )
             _render_stage(scene, out, frames, overrides, device=device or "cpu", overwrite=overwrite)
             return
         from mitsplat.dataset.shard_file import Shard
         from mitsplat.dataset.write import write_dataset
-        from mitsplat.engine.ray import Cluster
         from mitsplat.scene.loading.scene_loading import load_scene
 
         part = None if shard is None else Shard.parse(shard)
-        cluster = None
-        if engine == "ray":
-            cluster = Cluster(address, None if resources is None else Cluster.parse_resources(resources))
-            cluster.on_device(device)  # raises if the device contradicts the cluster's resources
+        cluster = _ray_cluster(address, resources, device) if engine == "ray" else None
         if tolerance is not None:
             if quality is not None:
                 raise InputError("--quality and --tolerance both select the preset: give only one")
@@ -185,6 +171,35 @@ def render(
                 any_device=any_device,
             )
         _print_summary(summary, whole=part is None)
+
+
+def _refuse_ineffective(given: set[str], scene: Path, *, only: int | None, engine: str) -> None:
+    """Raise InputError if a given option has no effect with the other options or on this kind of scene."""
+    from mitsplat.usd.usd_layers import is_usd
+
+    if only is not None:
+        ineffective = given & {"--frames", "--shard", "--engine", "--workers", "--overwrite"}
+        refuse_options(ineffective, "--only, which renders one image on this machine")
+    if engine != "ray":
+        refuse_options(given & {"--address", "--resources"}, "this machine: add --engine ray for a Ray cluster")
+    given -= {"--out", "--device", "--json", "--allow-outside"}
+    if scene.suffix == ".xml":
+        refuse_options(given, f"the Mitsuba scene {scene}, which has its own size, seed and quality")
+    elif is_usd(scene):
+        refuse_options(given - {"--frames", "--size", "--format", "--quality", "--overwrite"}, f"the USD stage {scene}")
+
+
+def _ray_cluster(address: str | None, resources: str | None, device: str | None) -> Cluster:
+    """Return a Ray cluster whose resources match the device.
+
+    Raises:
+        InputError: If they do not.
+    """
+    from mitsplat.engine.ray import Cluster
+
+    cluster = Cluster(address, None if resources is None else Cluster.parse_resources(resources))
+    cluster.on_device(device)
+    return cluster
 
 
 def _fastest_preset(
@@ -335,88 +350,6 @@ def split(
     for number, fold in enumerate(write_folds(dataset, folds), start=1):
         counts = format_counts(fold.instances)
         typer.echo(f"fold{number}: validates with {fold.images} images of {fold.layouts} layouts ({counts})")
-
-
-def export(
-    source: Annotated[Path, typer.Argument(metavar="ASSET|SCENE", help="Asset folder or scene file (.yaml).")],
-    frame: FrameIndex = 0,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Mitsuba scene (.xml), OpenUSD stage (.usd, .usda, .usdc, .usdz), MJCF, or the splats of ASSET as "
-            "glTF (.glb).",
-        ),
-    ] = Path("scene.xml"),
-    mjcf: Annotated[
-        bool, typer.Option("--mjcf", help="Write the .xml file as an MJCF model for MuJoCo instead of a Mitsuba scene.")
-    ] = False,
-    spz: Annotated[
-        bool, typer.Option("--spz", help="Compress the splats of a .glb file, which quantises them.")
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing file, including manual changes.")
-    ] = False,
-    allow_outside: AllowOutside = False,
-) -> None:
-    """Export one frame of SCENE, or ASSET, to other programs.
-
-    A Mitsuba scene can be edited and rendered with `mitsplat render`. A USD stage has splats, colliders, masses,
-    friction, poses at rest, camera, lights and semantic labels. An MJCF model has the bodies and shapes for MuJoCo.
-    A glTF file has the splats of ASSET alone. Whatever a format cannot hold is listed.
-    """
-    from mitsplat.usd.usd_layers import USD_SUFFIXES
-
-    check_new(out, ".xml", *(() if mjcf else (*USD_SUFFIXES, ".glb")), overwrite=overwrite)
-    to_gltf = out.suffix.lower() == ".glb"
-    if spz and not to_gltf:
-        raise InputError(f"--spz applies to .glb files (got {out})")
-    if to_gltf and not source.is_dir():
-        raise InputError(f"a .glb file holds the splats of an asset folder (got {source}): export a USD stage")
-    files = out.with_name(f"{out.stem}_files")
-    if files.exists() and not overwrite and not (files.is_dir() and not any(files.iterdir())):
-        raise InputError(f"--out {out}: the folder {files} must not exist yet; --overwrite replaces its files")
-    if source.is_dir():
-        losses = _export_asset(source, out, mjcf=mjcf, spz=spz)
-    else:
-        losses = _export_scene(source, frame, out, mjcf=mjcf, allow_outside=allow_outside)
-    for loss in losses:
-        typer.echo(f"not exported: {loss}")
-    typer.echo(f"{'asset' if source.is_dir() else 'scene'}: {out}")
-
-
-def _export_asset(folder: Path, out: Path, *, mjcf: bool, spz: bool) -> Sequence[str]:
-    """Export an asset, and return sentences on what the format cannot hold."""
-    if out.suffix.lower() == ".xml" and not mjcf:
-        raise InputError(f"--out of an asset must be a USD stage, .glb, or MJCF with --mjcf (got {out})")
-    from mitsplat.asset import Asset
-
-    asset = Asset.load(folder)
-    if out.suffix.lower() == ".glb":
-        from mitsplat.gltf_splats.splat_writing import export_asset_gltf
-
-        return export_asset_gltf(asset, out, spz=spz)
-    from mitsplat.usd.mjcf import export_asset_mjcf
-    from mitsplat.usd.usd_export import export_asset_usd
-
-    return (export_asset_mjcf if mjcf else export_asset_usd)(asset, out)
-
-
-def _export_scene(path: Path, frame: int, out: Path, *, mjcf: bool, allow_outside: bool) -> Sequence[str]:
-    """Export a frame of a scene, and return sentences on what the format cannot hold."""
-    from mitsplat.scene.loading.scene_loading import load_scene
-
-    scene = load_scene(path, allow_outside=allow_outside)
-    if out.suffix.lower() == ".xml" and not mjcf:
-        from mitsplat.frames.mitsuba_xml import export_xml
-
-        export_xml(scene, frame, out)
-        return () if scene.spec.background is None else ("the background image",)
-    from mitsplat.usd.mjcf import export_scene_mjcf
-    from mitsplat.usd.usd_export import export_scene_usd
-
-    return (export_scene_mjcf if mjcf else export_scene_usd)(scene, frame, out)
 
 
 def _print_summary(summary: DatasetSummary, *, whole: bool = True) -> None:

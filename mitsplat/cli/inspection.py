@@ -5,7 +5,7 @@ Each command imports its dependencies inside its function, so that all other com
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -28,6 +28,7 @@ from mitsplat.errors import InputError
 
 if TYPE_CHECKING:
     from mitsplat.findings import Finding
+    from mitsplat.frames.accuracy.speed_accuracy import Row
 
 
 def view(
@@ -206,10 +207,6 @@ def chart(
     objects with captured colours, and path tracing with fewer paths. Times are valid for this machine only. Memory is
     main memory, not GPU memory.
     """
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     from mitsplat.frames.accuracy.accuracy_chart import draw_chart, write_csv
     from mitsplat.frames.accuracy.speed_accuracy import check_tolerance, fastest_preset, measure_steps
     from mitsplat.runtime.device import find_device
@@ -228,7 +225,19 @@ def chart(
             progress=progress,
             device=chosen,
         )
-    best = fastest_preset(rows, tolerance)
+    _print_steps(rows, fastest_preset(rows, tolerance))
+    typer.echo(f"* fastest preset with an error of at most {tolerance:g}")
+    write_csv(rows, out.with_suffix(".csv"))
+    draw_chart(rows, out, title=f"{scene.name}: {frames} images", tolerance=tolerance)
+    typer.echo(f"chart: {out}, {out.with_suffix('.csv')}")
+
+
+def _print_steps(rows: Sequence[Row], best: Row) -> None:
+    """Print a table of measured steps with a mark at the best one."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     names = "RMSE", "PSNR [dB]", "largest", "estimate", "objects [dB]", "SSIM", "mask IoU", "peak [GiB]"
     table = Table()
     for title in ("step", "s/image", *names):
@@ -240,7 +249,3 @@ def chart(
             name, f"{row.seconds:.2f}", *errors, f"{row.ssim:.4f}", f"{row.mask_iou:.4f}", f"{row.memory:.2f}"
         )
     Console(width=120).print(table)
-    typer.echo(f"* fastest preset with an error of at most {tolerance:g}")
-    write_csv(rows, out.with_suffix(".csv"))
-    draw_chart(rows, out, title=f"{scene.name}: {frames} images", tolerance=tolerance)
-    typer.echo(f"chart: {out}, {out.with_suffix('.csv')}")

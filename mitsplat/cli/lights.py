@@ -94,22 +94,22 @@ def lights(
 
     check_ending(out, ".yaml", ".yml")
     refuse_to_replace(out, images)
-    photograph = None
-    if camera is None:
-        if len(images) > 1 or images[0].suffix.lower() not in HDR_SUFFIXES:
-            raise InputError(
-                f"{images[-1]}: must be the only input and an HDR panorama, {', '.join(HDR_SUFFIXES)}; for photographs "
-                "of a mirror ball, add --camera AZIMUTH ELEVATION"
-            )
-        if ball is not None or fov_x is not None or exposures is not None or reflectivity != _PERFECT_MIRROR:
-            raise InputError(
-                "--ball, --fov-x, --exposures and --reflectivity apply to photographs of a mirror ball: add --camera"
-            )
-    elif rotate_z:
+    is_hdr = images[0].suffix.lower() in HDR_SUFFIXES
+    if camera is not None and rotate_z:
         raise InputError(f"--rotate-z applies to panoramas; for a mirror ball, use --camera (got {rotate_z:g})")
-    elif irradiance is None and images[0].suffix.lower() not in HDR_SUFFIXES:
+    if camera is None and (len(images) > 1 or not is_hdr):
+        raise InputError(
+            f"{images[-1]}: must be the only input and an HDR panorama, {', '.join(HDR_SUFFIXES)}; for photographs "
+            "of a mirror ball, add --camera AZIMUTH ELEVATION"
+        )
+    of_ball = ball is not None or fov_x is not None or exposures is not None or reflectivity != _PERFECT_MIRROR
+    if camera is None and of_ball:
+        raise InputError(
+            "--ball, --fov-x, --exposures and --reflectivity apply to photographs of a mirror ball: add --camera"
+        )
+    if irradiance is None and not is_hdr:
         irradiance = _WHITE_IRRADIANCE
-    settings = LightSettings(around, distance, lamps, rest, rotate_z, irradiance)
+    settings, photograph = LightSettings(around, distance, lamps, rest, rotate_z, irradiance), None
     if camera is None:
         panorama = read_panorama(images[0])
     else:

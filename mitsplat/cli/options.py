@@ -83,28 +83,20 @@ def _scalar_types(hint: object) -> set[object]:
 
 
 def parse_whole_number(text: str | int) -> int:
-    """Return the number of a text of digits; the default of an option is a number already.
-
-    Raises:
-        BadParameter: If the text is no whole number.
-    """
-    is_range = isinstance(text, str) and re.fullmatch(r"\d+(-|:|,|\.\.)\d*", text)
-    return _parse_as(int, text, f"a whole number, such as 32{', not a range' if is_range else ''}")
+    """Return the whole number that a text, or the default of an option, states; raise BadParameter if there is none."""
+    is_range = re.fullmatch(r"\d+(-|:|,|\.\.)\d*", str(text))
+    return _parse_as(int, str(text), f"a whole number, such as 32{', not a range' if is_range else ''}")
 
 
 def parse_number(text: str | float) -> float:
-    """Return the number of a text with an optional decimal point; the default of an option is a number already.
-
-    Raises:
-        BadParameter: If the text is no number.
-    """
-    return _parse_as(float, text, "a number, such as 0.5")
+    """Return the number that a text, or the default of an option, states; raise BadParameter if there is none."""
+    return _parse_as(float, str(text), "a number, such as 0.5")
 
 
-def _parse_as(kind: type[_Number], text: str | float, rule: str) -> _Number:
-    """Return ``kind(text)`` without the digits of other scripts and the separators that Python permits."""
+def _parse_as(kind: type[_Number], text: str, rule: str) -> _Number:
+    """Return ``kind(text)``, but refuse the digits of other scripts and the separators that Python permits."""
     try:
-        if not str(text).isascii() or "_" in str(text):
+        if not text.isascii() or "_" in text:
             raise ValueError
         return kind(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Commands that make assets from photographs, in one call or stage by stage.
+"""Commands that make assets from photographs or captures, in one call or stage by stage.
 
 Each command imports its dependencies inside its function, so that all other commands start fast.
 """
@@ -12,6 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from mitsplat.cli.captures import (
+    Box,
+    Frames,
+    MaskModel,
+    Masks,
+    Photos,
+    Picks,
+    PicksNot,
+    Poses,
+    ScaleFrom,
+    capture_settings,
+)
 from mitsplat.cli.console import progress_bar, select_device, stage_bar
 from mitsplat.cli.options import (
     AssetFolder,
@@ -24,49 +36,16 @@ from mitsplat.cli.options import (
     Roughness,
     Seed,
     ShDegree,
-    check_new,
     parse_number,
-    parse_pair,
     uniform_material,
 )
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
-    from mitsplat.capture.boards.targets import Board
-    from mitsplat.capture.pipeline.capture_settings import CaptureSettings
+    from mitsplat.fit.fit_folder import FitResult
     from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; an object needs masks.")]
-Photos = Annotated[
-    Path, typer.Argument(metavar="PHOTOS", help="Folder of photographs of one object or place, or a video file.")
-]
-Frames = Annotated[int, typer.Option(help="Maximum number of frames to take from a video.")]
-Poses = Annotated[
-    Path | None,
-    typer.Option(help="Camera poses from another tool: folder of a COLMAP model, or a NeRF transforms.json."),
-]
-Masks = Annotated[Path | None, typer.Option(help="Folder of masks, named PHOTO.png; white marks the object.")]
-MaskModel = Annotated[
-    Path | None, typer.Option(help="Segmentation network (.onnx) that computes the masks through rembg.")
-]
-ScaleFrom = Annotated[
-    tuple[str, str, float] | None,
-    typer.Option(
-        metavar="A B METRES",
-        help="Known distance between two points. Each of A and B is PHOTO (the centre of its camera) or PHOTO:X,Y (the "
-        "surface at this pixel).",
-    ),
-]
-Picks = Annotated[
-    list[str] | None,
-    typer.Option("--pick", metavar="PHOTO:X,Y", help="Pixel on the object, in CAPTURE/images; repeatable."),
-]
-PicksNot = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--pick-not", metavar="PHOTO:X,Y", help="Pixel on something that does not belong to the object; repeatable."
-    ),
-]
 Remove = Annotated[
     list[str] | None,
     typer.Option(
@@ -74,10 +53,6 @@ Remove = Annotated[
         metavar="PHOTO:X,Y",
         help="Remove the object at this pixel, in CAPTURE/images, from an environment; repeatable.",
     ),
-]
-Box = Annotated[
-    tuple[float, float, float, float, float, float] | None,
-    typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box that contains the object, in the frame of the capture."),
 ]
 Size = Annotated[
     float | None,
@@ -174,6 +149,15 @@ def fit(
             )
 
         result = fit_capture(loaded, out, settings, depths=maps, overwrite=overwrite, progress=progress)
+    _print_fit(out, result, target_psnr)
+
+
+def _print_fit(out: Path, result: FitResult, target_psnr: float | None) -> None:
+    """Print the result of a fit.
+
+    Raises:
+        PartialResultError: If the fit does not reach the target (exit status 4).
+    """
     for warning in result.warnings:
         typer.echo(f"warning: {warning}")
     typer.echo(
@@ -188,85 +172,6 @@ def fit(
                 f"{out}: PSNR must reach {target_psnr:.2f} dB (got {reached:.2f}); use more iterations or "
                 "Gaussians, or more photos with overlap and even light"
             )
-
-
-def capture(
-    photos: Photos,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Capture folder to write.")],
-    kind: Annotated[
-        Literal["object", "environment"],
-        typer.Option(help="object: the subject is segmented by masks; environment: whole photos are used."),
-    ] = "object",
-    frames: Frames = 150,
-    max_size: Annotated[int, typer.Option(help="Longest edge of the photos [px]; larger photos are reduced.")] = 1600,
-    squares: Annotated[
-        str, typer.Option(metavar="CxR", help="Number of squares of the ChArUco board, columns x rows.")
-    ] = "7x5",
-    square: Annotated[float, typer.Option(help="Edge length of a board square, measured on the print [m].")] = 0.035,
-    tag: Annotated[
-        float | None, typer.Option(help="Edge length of the black border of printed AprilTags (36h11) [m].")
-    ] = None,
-    scale_from: ScaleFrom = None,
-    poses: Poses = None,
-    metric: Annotated[bool, typer.Option("--metric", help="The poses of --poses are in metres with z up.")] = False,
-    masks: Masks = None,
-    mask_model: MaskModel = None,
-    pick: Picks = None,
-    pick_not: PicksNot = None,
-    box: Box = None,
-    undistort: Annotated[
-        bool, typer.Option("--undistort", help="Resample the photos to pinhole cameras without lens distortion.")
-    ] = False,
-) -> None:
-    """Find camera poses, scale, gravity and masks of PHOTOS.
-
-    An interrupted run continues when the command runs again. The exit status is 4 if too many photos are unusable.
-    """
-    from mitsplat.capture.pipeline.capture_pipeline import capture_photos
-
-    settings = replace(
-        _capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box),
-        max_size=max_size,
-        board=_parse_board(squares, square),
-        tag=tag,
-        metric=metric,
-        undistorted=undistort,
-    )
-    with stage_bar("steps/s") as progress:
-        result = capture_photos(photos, out, settings, progress=progress)
-    found, video = result.capture, result.video
-    if video is not None:
-        typer.echo(f"video: {len(video.names)} of {video.read} frames ({video.seconds:.1f} s) in {video.folder}")
-    for name, reason in sorted(found.rejected.items()):
-        typer.echo(f"rejected: {name}: {reason}")
-    for warning in result.warnings:
-        typer.echo(f"warning: {warning}")
-    points = f"{len(found.points)} points" + (f", {result.reprojection_error:.2f} px" if len(found.points) else "")
-    typer.echo(f"capture: {out} ({len(found.photos)} of {result.given} photos, {points})")
-    scale = "in metres" if found.units == "metre" else "in unknown units"
-    error = "" if found.scale_error is None else f" ± {found.scale_error:.2%}"
-    typer.echo(f"frame: {scale}{error}, {'z up' if found.up == 'z' else 'up unknown'}, by {result.source}")
-    if result.exposure is not None:
-        typer.echo(f"exposure: {result.exposure}")
-    typer.echo(f"picture: {out / 'capture.png'}")
-    if result.shortcoming is not None:
-        raise PartialResultError(f"{out}: {result.shortcoming}")
-
-
-def board(
-    out: Annotated[Path, typer.Option("--out", "-o", help="PDF file to write (.pdf).")] = Path("board.pdf"),
-    paper: Annotated[Literal["a4", "letter", "a3"], typer.Option(help="Paper size, in landscape.")] = "a4",
-    squares: Annotated[str, typer.Option(metavar="CxR", help="Number of squares, columns x rows.")] = "7x5",
-    square: Annotated[float, typer.Option(help="Edge length of a square [m].")] = 0.035,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
-) -> None:
-    """Write a printable ChArUco board (PDF).
-
-    Place the object on the board or beside it. `mitsplat capture` then finds the scale in metres and the vertical.
-    """
-    check_new(out, ".pdf", overwrite=overwrite)
-    _parse_board(squares, square).write_pdf(out, paper)
-    typer.echo(f"board: {out} (print at 100 %, then measure a square and give it to `mitsplat capture --square`)")
 
 
 def mesh(
@@ -393,47 +298,12 @@ def asset(
         remove=tuple(remove or ()),
         material=uniform_material(metallic, roughness),
     )
-    capture = _capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box)
+    capture = capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box)
     fit = replace(default_fit(kind), budget=None if budget is None else _parse_duration(budget))
     select_device(device)
     with stage_bar("steps/s") as progress:
         done = asset_from_photos(photos, out, job, capture=capture, fit=fit, progress=progress)
     _print_result(done)
-
-
-def _capture_settings(
-    kind: Kind,
-    frames: Frames,
-    scale_from: ScaleFrom,
-    poses: Poses,
-    masks: Masks,
-    mask_model: MaskModel,
-    pick: Picks,
-    pick_not: PicksNot,
-    box: Box,
-) -> CaptureSettings:
-    """Return the capture settings from the options that `capture` and `asset` share."""
-    from mitsplat.capture.pipeline.capture_settings import CaptureSettings
-
-    return CaptureSettings(
-        kind=kind,
-        frames=frames,
-        scale_from=scale_from,
-        poses=poses,
-        masks=masks,
-        mask_model=mask_model,
-        picks=tuple(pick or ()),
-        picks_not=tuple(pick_not or ()),
-        box=box,
-    )
-
-
-def _parse_board(squares: str, square: float) -> Board:
-    from mitsplat.capture.boards.targets import Board
-
-    if (counts := parse_pair(squares)) is None:
-        raise InputError(f"--squares must be COLUMNSxROWS, such as 7x5 (got {squares})")
-    return Board(*counts, square)
 
 
 def _print_result(done: AssetResult) -> None:

@@ -20,12 +20,7 @@ from mitsplat.renderer.composition.scene_contents import ContentsReader, SceneCo
 from mitsplat.renderer.composition.shape_state import ShapeState
 from mitsplat.renderer.instances.antialiasing import Edges
 from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
-from mitsplat.renderer.instances.silhouettes import (
-    PlacedMesh,
-    proxy_silhouettes,
-    splat_silhouettes,
-    with_area_beyond,
-)
+from mitsplat.renderer.instances.silhouettes import PlacedMesh, proxy_silhouettes, splat_silhouettes, with_area_beyond
 from mitsplat.renderer.light.light import light_factor
 from mitsplat.renderer.light.lighting import Accuracy
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
@@ -131,7 +126,18 @@ class LayerRenderer:
             ground = meshes.before(static) if meshes else static
             dr.eval(seen, ground)
             visible = VisibleSurfaces(contents.traits, view, contents.proxies, rays.o, seen, hit, ground)
-            light, highlight = self._light(contents, scene, visible, accuracy, seed, white)
+            light, highlight = light_factor(
+                scene,
+                contents.proxies,
+                visible,
+                accuracy=accuracy,
+                seed=seed,
+                reference=self.reference,
+                white=white,
+                sky_reach=self.sky_reach or np.inf,
+                grid=contents.grid,
+                bounce=self.bounce,
+            )
         if not self.highlight:
             highlight = mi.Color3f(0)
         rgb, captured = shown.lit(light, highlight, radiance)
@@ -152,29 +158,6 @@ class LayerRenderer:
         if self.quality.rays_at_borders > 1:
             layers |= self._smooth_edges(contents, scene, view, layers, shown.key, radiance, white)
         return layers
-
-    def _light(
-        self,
-        contents: SceneContents,
-        scene: mi.Scene,
-        visible: VisibleSurfaces,
-        accuracy: Accuracy,
-        seed: int,
-        white: mi.Color3f,
-    ) -> tuple[mi.Color3f, mi.Color3f]:
-        """Trace the light factor and the highlight (Color3f) of visible surfaces."""
-        return light_factor(
-            scene,
-            contents.proxies,
-            visible,
-            accuracy=accuracy,
-            seed=seed,
-            reference=self.reference,
-            white=white,
-            sky_reach=self.sky_reach or np.inf,
-            grid=contents.grid,
-            bounce=self.bounce,
-        )
 
     def _smooth_edges(
         self,

@@ -114,9 +114,7 @@ def proxy_silhouettes(proxies: Mapping[int, Sequence[PlacedMesh]], view: CameraV
 
 
 def with_area_beyond(
-    found: Mapping[int, Silhouette],
-    proxies: Mapping[int, Sequence[PlacedMesh]],
-    view: CameraView,
+    found: Mapping[int, Silhouette], proxies: Mapping[int, Sequence[PlacedMesh]], view: CameraView
 ) -> dict[int, Silhouette]:
     """Return silhouettes with the area of their proxies beyond the canvas, where they reach it and the image."""
     canvas, left, top = _canvas(view)
@@ -260,13 +258,7 @@ def _covered(lists: TileLists, view: CameraView, quality: Quality, runs: _Runs) 
 
 
 def _assemble(
-    tile: UInt32Array,
-    slot: UInt32Array,
-    bits: UInt32Array,
-    ids: Int64Array,
-    canvas: CameraView,
-    left: int,
-    top: int,
+    tile: UInt32Array, slot: UInt32Array, bits: UInt32Array, ids: Int64Array, canvas: CameraView, left: int, top: int
 ) -> dict[int, Silhouette]:
     """Assemble the masks of instances from those of their tiles."""
     columns = bits.astype(np.uint8).reshape(len(tile), TILE_WIDTH)

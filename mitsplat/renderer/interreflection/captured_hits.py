@@ -105,12 +105,7 @@ class CapturedHits:
         return 1 - lost
 
     def paths_to_objects(
-        self,
-        dynamic: TraceScene,
-        boxes: Boxes,
-        place: mi.SurfaceInteraction3f,
-        captured: mi.Color3f,
-        key: mi.UInt32,
+        self, dynamic: TraceScene, boxes: Boxes, place: mi.SurfaceInteraction3f, captured: mi.Color3f, key: mi.UInt32
     ) -> tuple[mi.UInt32, Paths] | None:
         """Return paths from captured surfaces to objects that light them, and their lanes; None if there are none.
 

@@ -170,12 +170,7 @@ class LightFilter:
         return LightMeans(mi.Color3f(*values[:3]), mi.Color3f(*values[3:6]), mean_bounced)
 
     def mirror(
-        self,
-        values: list[mi.Float],
-        mirrored: mi.Vector3f,
-        radius: int = RADIUS,
-        *,
-        guide: Guide | None = None,
+        self, values: list[mi.Float], mirrored: mi.Vector3f, radius: int = RADIUS, *, guide: Guide | None = None
     ) -> tuple[list[mi.Float], mi.Float]:
         """Average reflected light per ray over neighbours that mirror similar directions.
 
@@ -247,12 +242,7 @@ class LightFilter:
         return self._average(values, dr.full(mi.Float, 1, dr.width(self.index)), radius)[0]
 
     def _average(
-        self,
-        values: list[mi.Float],
-        rays: mi.Float,
-        radius: int,
-        guide: Guide | None = None,
-        lobe: _Lobe | None = None,
+        self, values: list[mi.Float], rays: mi.Float, radius: int, guide: Guide | None = None, lobe: _Lobe | None = None
     ) -> tuple[list[mi.Float], mi.Float]:
         """Return averages, and the effective number of equally weighted pixels with the same number of rays."""
         here = self.here

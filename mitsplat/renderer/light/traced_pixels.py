@@ -234,9 +234,7 @@ class TracedPixels:
         if not dr.width(glossy):
             return light, mi.Color3f(0)
         tracer = ReflectionTracer(
-            self._point_tracer,
-            lighting.reflectors,
-            points.steps(dr.arange(mi.UInt32, dr.width(points.owner))),
+            self._point_tracer, lighting.reflectors, points.steps(dr.arange(mi.UInt32, dr.width(points.owner)))
         )
         valid_share = dr.maximum(dr.gather(mi.Float, points.valid_share, glossy), 1e-3)
         sums = gathered(self._trace_reflections(tracer, exposure), glossy).of_valid(valid_share)

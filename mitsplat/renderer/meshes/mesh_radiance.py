@@ -162,12 +162,7 @@ class PathTracer:
             continuing = dr.compress(continuing)
             if not dr.width(continuing):
                 break
-            path = _Path(
-                dr.gather(mi.UInt32, lane, continuing),
-                dr.gather(mi.Ray3f, ray, continuing),
-                dr.gather(mi.PreliminaryIntersection3f, hit, continuing),
-                dr.gather(mi.Color3f, throughput, continuing),
-            )
+            path = gathered(path, continuing)
             dr.eval(path)
         return result
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -123,16 +124,8 @@ class CameraView:
 
     def finer(self, zoom: int) -> CameraView:
         """Return the same view with each pixel divided into ``zoom`` x ``zoom`` pixels."""
-        return replace(
-            self,
-            width=zoom * self.width,
-            height=zoom * self.height,
-            fx=zoom * self.fx,
-            fy=zoom * self.fy,
-            cx=zoom * self.cx,
-            cy=zoom * self.cy,
-            zoom=zoom * self.zoom,
-        )
+        numbers: dict[str, Any] = {n: zoom * getattr(self, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
+        return replace(self, zoom=zoom * self.zoom, **numbers)
 
     @property
     def camera(self) -> Camera:

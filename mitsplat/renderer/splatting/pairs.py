@@ -151,11 +151,7 @@ class _Spans:
 
 
 def _spans_of_rows(
-    records: ViewRecords,
-    count: int,
-    view: CameraView,
-    quality: Quality,
-    subset: TileSubset | TileBox | None,
+    records: ViewRecords, count: int, view: CameraView, quality: Quality, subset: TileSubset | TileBox | None
 ) -> _Spans | None:
     """Find the spans of ``count`` records in every row of their tile boxes; return None if there are no rows."""
     order = dr.arange(mi.UInt32, count)

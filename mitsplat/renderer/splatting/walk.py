@@ -190,12 +190,7 @@ def _walk_in_window(rays: Rays, fresh: Callable[[], Pixel], blend: Blend) -> lis
             # Peaks in front of the new one, or equal to it, move forward by one slot.
             deeper = z >= slot_z
             result.insert(
-                0,
-                (
-                    dr.maximum(z, slot_z),
-                    dr.select(deeper, alpha, slot_alpha),
-                    dr.select(deeper, number, slot_number),
-                ),
+                0, (dr.maximum(z, slot_z), dr.select(deeper, alpha, slot_alpha), dr.select(deeper, number, slot_number))
             )
             alpha, number = dr.select(deeper, slot_alpha, alpha), dr.select(deeper, slot_number, number)
             z = dr.minimum(z, slot_z)

@@ -193,11 +193,7 @@ def _candidate_views(
 
 
 def _best_view(
-    scene: Scene,
-    index: int,
-    camera: CameraHemisphere,
-    predictor: VisibilityPredictor,
-    candidates: Iterable[_Candidate],
+    scene: Scene, index: int, camera: CameraHemisphere, predictor: VisibilityPredictor, candidates: Iterable[_Candidate]
 ) -> Viewpoint:
     """Return the accepted candidate view whose shares of hidden and cut objects are nearest to the targets.
 

@@ -70,8 +70,7 @@ class Randomise(StrictModel):
         "image [px]. Green and the labels do not move.",
     )
     motion_blur: BlurRange = Field(
-        (0.0, 0.0),
-        description="Length of the motion blur in the image [px]. Its direction is drawn for every frame.",
+        (0.0, 0.0), description="Length of the motion blur in the image [px]. Its direction is drawn for every frame."
     )
     sharpening: NonNegativeRange = Field(
         (0.0, 0.0),
@@ -211,8 +210,7 @@ class Composite(StrictModel):
         "``randomise.exposure`` is added in all cases.",
     )
     white_balance: Annotated[
-        Kelvin | Literal["auto"],
-        BeforeValidator(_check_white_balance, json_schema_input_type=Kelvin | Literal["auto"]),
+        Kelvin | Literal["auto"], BeforeValidator(_check_white_balance, json_schema_input_type=Kelvin | Literal["auto"])
     ] = Field(
         DAYLIGHT,
         description="Colour temperature that appears white [K]. ``auto`` makes a white surface neutral at the bottom "

@@ -146,8 +146,7 @@ class SceneSpec(StrictModel):
         "name. Each layout draws one environment.",
     )
     environment_collides: bool = Field(
-        False,
-        description="Objects also rest on the mesh of the environment. Its convex decomposition takes minutes.",
+        False, description="Objects also rest on the mesh of the environment. Its convex decomposition takes minutes."
     )
     shapes: tuple[Shape, ...] = Field((), description="Static shapes, such as a tabletop or walls.")
     backdrop: Backdrop | None = optional_field(

@@ -37,8 +37,7 @@ class Shape(StrictModel):
     )
     bin: Bin | None = Field(None, description="Geometry: an open bin.")
     mesh: str | None = Field(
-        None,
-        description="Geometry: a mesh file, relative to the scene file. Its vertices are in world coordinates.",
+        None, description="Geometry: a mesh file, relative to the scene file. Its vertices are in world coordinates."
     )
     units: Positive | None = Field(
         None,

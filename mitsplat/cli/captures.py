@@ -5,19 +5,17 @@ Each command imports its dependencies inside its function, so that all other com
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from mitsplat.cli.console import stage_bar
-from mitsplat.cli.options import Kind, check_new, parse_pair
+from mitsplat.cli.options import check_new, parse_pair
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
     from mitsplat.capture.boards.targets import Board
-    from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 
 Photos = Annotated[
     Path, typer.Argument(metavar="PHOTOS", help="Folder of photographs of one object or place, or a video file.")
@@ -88,13 +86,22 @@ def capture(
     An interrupted run continues when the command runs again. The exit status is 4 if too many photos are unusable.
     """
     from mitsplat.capture.pipeline.capture_pipeline import capture_photos
+    from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 
-    settings = replace(
-        capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box),
+    settings = CaptureSettings(
+        kind=kind,
+        frames=frames,
         max_size=max_size,
         board=_parse_board(squares, square),
         tag=tag,
+        scale_from=scale_from,
+        poses=poses,
         metric=metric,
+        masks=masks,
+        mask_model=mask_model,
+        picks=tuple(pick or ()),
+        picks_not=tuple(pick_not or ()),
+        box=box,
         undistorted=undistort,
     )
     with stage_bar("steps/s") as progress:
@@ -132,33 +139,6 @@ def board(
     check_new(out, ".pdf", overwrite=overwrite)
     _parse_board(squares, square).write_pdf(out, paper)
     typer.echo(f"board: {out} (print at 100 %, then measure a square and give it to `mitsplat capture --square`)")
-
-
-def capture_settings(
-    kind: Kind,
-    frames: Frames,
-    scale_from: ScaleFrom,
-    poses: Poses,
-    masks: Masks,
-    mask_model: MaskModel,
-    pick: Picks,
-    pick_not: PicksNot,
-    box: Box,
-) -> CaptureSettings:
-    """Return the capture settings from the options that `capture` and `asset` share."""
-    from mitsplat.capture.pipeline.capture_settings import CaptureSettings
-
-    return CaptureSettings(
-        kind=kind,
-        frames=frames,
-        scale_from=scale_from,
-        poses=poses,
-        masks=masks,
-        mask_model=mask_model,
-        picks=tuple(pick or ()),
-        picks_not=tuple(pick_not or ()),
-        box=box,
-    )
 
 
 def _parse_board(squares: str, square: float) -> Board:

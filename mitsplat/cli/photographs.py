@@ -12,18 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mitsplat.cli.captures import (
-    Box,
-    Frames,
-    MaskModel,
-    Masks,
-    Photos,
-    Picks,
-    PicksNot,
-    Poses,
-    ScaleFrom,
-    capture_settings,
-)
+from mitsplat.cli.captures import Box, Frames, MaskModel, Masks, Photos, Picks, PicksNot, Poses, ScaleFrom
 from mitsplat.cli.console import progress_bar, select_device, stage_bar
 from mitsplat.cli.options import (
     AssetFolder,
@@ -285,6 +274,7 @@ def asset(
     In an environment, level surfaces are detected. The command also writes a scene file beside the asset folder, which
     drops objects on the surface at which the photos are directed.
     """
+    from mitsplat.capture.pipeline.capture_settings import CaptureSettings
     from mitsplat.reconstruct.materials.capture_light import CaptureLight
     from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos, default_fit
     from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
@@ -298,7 +288,17 @@ def asset(
         remove=tuple(remove or ()),
         material=uniform_material(metallic, roughness),
     )
-    capture = capture_settings(kind, frames, scale_from, poses, masks, mask_model, pick, pick_not, box)
+    capture = CaptureSettings(
+        kind=kind,
+        frames=frames,
+        scale_from=scale_from,
+        poses=poses,
+        masks=masks,
+        mask_model=mask_model,
+        picks=tuple(pick or ()),
+        picks_not=tuple(pick_not or ()),
+        box=box,
+    )
     fit = replace(default_fit(kind), budget=None if budget is None else _parse_duration(budget))
     select_device(device)
     with stage_bar("steps/s") as progress:

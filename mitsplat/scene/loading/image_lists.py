@@ -15,13 +15,14 @@ from mitsplat.images.untrusted_images import IMAGE_SUFFIXES
 from mitsplat.storage.file_kinds import check_path_encoding
 
 WILDCARDS = frozenset("*?[")
-
+"""Characters that make a name a pattern."""
 
 MAX_ENTRIES = 1_000_000
 """Maximum number of folder entries that a pattern may visit."""
 MAX_PARTS = 64
+"""Maximum number of parts of a pattern, separated by slashes."""
 MAX_LENGTH = 4096
-"""Length of a pattern: that of the longest path [characters]."""
+"""Maximum length of a pattern, that of the longest path [characters]."""
 
 
 def glob_below(folder: Path, pattern: str) -> list[Path]:

@@ -22,9 +22,12 @@ from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import Surfels, place_surfels
 
 _KINDS = ("box", "cylinder", "sphere", "capsule", "cone")
-_EXTENT = (0.025, 0.06)  # range of the longest extent [m]
+_EXTENT = (0.025, 0.06)
+"""Range of the longest extent [m]."""
 _SURFELS = 1200
-_INNER_SCALE = 0.97  # relative size of the second layer
+"""Number of Gaussians of the outer layer."""
+_INNER_SCALE = 0.97
+"""Size of the second layer, relative to the first."""
 
 
 def make_primitives(streams: Iterable[np.random.Generator]) -> tuple[Asset, ...]:

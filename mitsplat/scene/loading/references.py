@@ -76,7 +76,7 @@ def expand_patterns(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scen
     for position, entry in enumerate(objects):
         if isinstance(entry.pool, str) and entry.pool != PRIMITIVES:
             with errors_at_key(path, "objects", position, "pool"):
-                names = _matches(path.parent, entry.pool, "object", allow_outside=allow_outside)
+                names = _matched_assets(path.parent, entry.pool, "object", allow_outside=allow_outside)
             objects[position] = entry.model_copy(update={"pool": names})
     for position, light in enumerate(lights):
         if isinstance(light, EnvironmentLight) and isinstance(light.pool, str):
@@ -94,17 +94,19 @@ def _checked_names(folder: Path, names: tuple[str, ...], allow_outside: bool) ->
 
 
 def _matched_environments(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSpec:
+    """Replace a pattern of environments by the names that match it."""
     pattern = spec.environment
     if not isinstance(pattern, str):
         return spec
     if WILDCARDS & set(pattern) and not (path.parent / pattern / ASSET_FILE).is_file():
         with errors_at_key(path, "environment"):
-            names = _matches(path.parent, pattern, "environment", allow_outside=allow_outside)
+            names = _matched_assets(path.parent, pattern, "environment", allow_outside=allow_outside)
         spec = spec.model_copy(update={"environment": names})
     return spec
 
 
 def _matched_images(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSpec:
+    """Replace the patterns of images of materials and of the background by the names that match them."""
     found = {}
     for keys, images in image_lists(spec):
         with errors_at_key(path, *keys):
@@ -135,10 +137,10 @@ def _matched_images(spec: SceneSpec, path: Path, allow_outside: bool) -> SceneSp
     return spec.model_copy(update={"background": background})
 
 
-def _matches(
+def _matched_assets(
     folder: Path, pattern: str, kind: Literal["object", "environment"], *, allow_outside: bool
 ) -> tuple[str, ...]:
-    """Return the folders of assets of a kind that match a pattern, relative to a folder."""
+    """Return the names of the assets of a kind that match a pattern: their folders, relative to ``folder``."""
     found = [path for path in glob_below(folder, pattern) if (path / ASSET_FILE).is_file()]
     named = _checked_names(folder, names_below(folder, pattern, found), allow_outside)
     names = tuple(name for name in named if read_spec(folder / name).kind == kind)

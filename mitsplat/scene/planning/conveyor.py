@@ -128,15 +128,10 @@ def check_belt(spec: SceneSpec) -> None:
     reach = 0.0
     for region, _ in spec.all_regions:
         corners = trimesh.bounds.corners(np.array([region.min, region.max]))
-        x, y, z = ((corners - pose[:3, 3]) @ pose[:3, :3]).T
-        if (
-            z.max() > 0
-            and x.min() < length / 2
-            and x.max() > -length / 2
-            and y.min() < width / 2
-            and y.max() > -width / 2
-        ):
-            reach = max(reach, float(abs(x).max()))
+        corners = (corners - pose[:3, 3]) @ pose[:3, :3]
+        (x0, y0, _), (x1, y1, z1) = corners.min(axis=0), corners.max(axis=0)
+        if z1 > 0 and x0 < length / 2 and x1 > -length / 2 and y0 < width / 2 and y1 > -width / 2:
+            reach = max(reach, float(abs(x0)), float(abs(x1)))
     wanted = 2 * (reach + abs(belt.travel))
     if not reach:
         raise InputError("must be below a region, so that it carries objects")

@@ -37,12 +37,9 @@ def lights_at(spec: SceneSpec, layout: int, index: int, time: float) -> tuple[Li
         if isinstance(light, EnvironmentLight):
             light = _with_image(light, random_stream(spec.seed, f"light {position} image", layout))
         for copy in range(copies):
-            one = (
-                light
-                if light.draw is None
-                else _draw_values(light, light.draw, spec.seed, f"{position}.{copy}", number)
-            )
-            found.append(_at_time(one, time))
+            name, draw = f"{position}.{copy}", light.draw
+            drawn = light if draw is None else _draw_values(light, draw, spec.seed, name, number)
+            found.append(_at_time(drawn, time))
     return tuple(found)
 
 

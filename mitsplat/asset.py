@@ -282,11 +282,7 @@ class Asset:
             mesh=None if self.mesh is None else self.mesh.copy().apply_transform(matrix),
             pieces=tuple(piece.copy().apply_transform(matrix) for piece in self.pieces),
             keypoints=dict(
-                zip(
-                    self.keypoints,
-                    map(tuple, transform_points(matrix, self.keypoint_array).tolist()),
-                    strict=True,
-                )
+                zip(self.keypoints, map(tuple, transform_points(matrix, self.keypoint_array).tolist()), strict=True)
             ),
         )
 

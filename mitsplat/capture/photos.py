@@ -52,12 +52,7 @@ _MAX_NOISE = 0.02
 _PLAIN_BORDER = 0.5
 """Minimum fraction of the border of a photo that a plain background takes."""
 
-_LENS_TAGS = (
-    ExifTags.Base.Make,
-    ExifTags.Base.Model,
-    ExifTags.Base.FocalLength,
-    ExifTags.Base.FocalLengthIn35mmFilm,
-)
+_LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 """EXIF data that differ between cameras and zoom settings."""
 _MAX_LABEL = 50
 """Largest value of a mask that stores labels in place of white."""

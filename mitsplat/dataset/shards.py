@@ -10,13 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from mitsplat.dataset.dataset_files import CONTENT, RUNS, TIMINGS
-from mitsplat.dataset.dataset_folder import (
-    DEFAULT_CONTENT,
-    finish_folder,
-    first_difference,
-    open_finished,
-    open_folder,
-)
+from mitsplat.dataset.dataset_folder import DEFAULT_CONTENT, finish_folder, first_difference, open_finished, open_folder
 from mitsplat.dataset.records.manifest import Manifest, read_lines
 from mitsplat.dataset.records.record_schema import read_content
 from mitsplat.dataset.shard_file import describe_shard, read_shard

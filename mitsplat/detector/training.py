@@ -24,13 +24,7 @@ from pathlib import Path
 
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, check_masks, reorder_classes
 from mitsplat.detector.labelled_sets.set_reading import read_set
-from mitsplat.detector.libraries import (
-    check_weights,
-    load_libraries,
-    read_network,
-    torch_device,
-    versions,
-)
+from mitsplat.detector.libraries import check_weights, load_libraries, read_network, torch_device, versions
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.photo_tiles import cut_photographs
 from mitsplat.detector.train_settings import TrainSettings

@@ -257,13 +257,7 @@ class Camera:
         """Return the same camera with another pixel grid over the same image area."""
         sx, sy = width / self.width, height / self.height
         return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
     def fitted(self, size: float) -> Camera:

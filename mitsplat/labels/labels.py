@@ -297,12 +297,7 @@ def label_instances(
 
 
 def _label_instance(
-    instance: Instance,
-    class_name: str,
-    visible: Silhouette,
-    truth: Truth,
-    rules: LabelRules,
-    second_bounds: Box | None,
+    instance: Instance, class_name: str, visible: Silhouette, truth: Truth, rules: LabelRules, second_bounds: Box | None
 ) -> InstanceLabel:
     """Label an instance of a class by the ``visible`` part of its silhouette, without keypoints.
 

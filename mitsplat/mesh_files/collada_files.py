@@ -157,11 +157,7 @@ def with_gloss(material: Material, effect: Any) -> Material:
         warnings.append("it mirrors its surroundings (reflectivity), which is left out")
     shiny = specular > 0
     return replace(
-        material,
-        specular=specular,
-        shiny=shiny,
-        roughness=roughness if shiny else 1.0,
-        warnings=tuple(warnings),
+        material, specular=specular, shiny=shiny, roughness=roughness if shiny else 1.0, warnings=tuple(warnings)
     )
 
 

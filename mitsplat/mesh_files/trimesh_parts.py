@@ -199,15 +199,7 @@ def _read_mtl(source: SimpleMaterial, uv: Float64Array | None) -> Material:
         roughness = float(np.clip(given_roughness[0], LEAST_ROUGHNESS, 1.0))
     metal = 0.0 if metallic is None else float(np.clip(metallic[0], 0.0, 1.0))
     shiny = specular > 0 or metal > 0
-    return Material(
-        factor,
-        texture,
-        metal,
-        roughness if shiny else 1.0,
-        specular,
-        shiny,
-        tuple(warnings),
-    )
+    return Material(factor, texture, metal, roughness if shiny else 1.0, specular, shiny, tuple(warnings))
 
 
 def _numbers(keys: Mapping[str, npt.ArrayLike], name: str) -> Float64Array | None:

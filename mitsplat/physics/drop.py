@@ -385,11 +385,7 @@ class Drop:
                 MujocoWorld(bodies, static.colliders, timestep=TIMESTEP)
                 if self.scene.spec.settle.stepper == "mujoco"
                 else WarpWorld(
-                    bodies,
-                    static.colliders,
-                    timestep=TIMESTEP,
-                    capacity=capacity,
-                    contact_finder=static.contact_finder,
+                    bodies, static.colliders, timestep=TIMESTEP, capacity=capacity, contact_finder=static.contact_finder
                 )
             )
         return self._worlds[key]

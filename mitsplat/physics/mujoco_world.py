@@ -41,9 +41,7 @@ class MujocoWorld(World):
         if mujoco.get_mju_user_warning() is None:  # else MuJoCo writes MUJOCO_LOG.TXT into the working folder
             mujoco.set_mju_user_warning(_logger.debug)
         solver = PairContactSolver(
-            build_model(bodies, colliders, IMPEDANCE_MUJOCO, False),
-            use_mujoco_cpu=True,
-            **SOLVER_OPTIONS,
+            build_model(bodies, colliders, IMPEDANCE_MUJOCO, False), use_mujoco_cpu=True, **SOLVER_OPTIONS
         )
         self._model, self._data = solver.mj_model, solver.mj_data
         self._model.opt.timestep, self._model.opt.tolerance = timestep, _TOLERANCE

@@ -115,12 +115,7 @@ def layout_from_newton(
 
 
 def camera_from_mujoco(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    name: str | int,
-    *,
-    width: int | None = None,
-    height: int | None = None,
+    model: mujoco.MjModel, data: mujoco.MjData, name: str | int, *, width: int | None = None, height: int | None = None
 ) -> Camera:
     """Create a camera from a camera of MuJoCo: pose, and ``fovy`` or the intrinsics of its sensor.
 

@@ -218,11 +218,7 @@ def _captured_loss(seen: Observations, near: Int64Array) -> float:
 
 
 def _trace(
-    surfaces: LitMesh,
-    points: Float64Array,
-    normals: Float64Array,
-    seen: Observations,
-    roughness: Float64Array,
+    surfaces: LitMesh, points: Float64Array, normals: Float64Array, seen: Observations, roughness: Float64Array
 ) -> Reflectance:
     light = surfaces.light(points, normals)
     return surfaces.reflectance(light, seen.point, seen.to_camera, roughness.tolist())

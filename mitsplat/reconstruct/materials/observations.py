@@ -113,11 +113,7 @@ def observe(
 
 
 def clear_points(
-    mesh: trimesh.Trimesh,
-    surfaces: LitMesh,
-    points: Float64Array,
-    normals: Float64Array,
-    views: Sequence[View],
+    mesh: trimesh.Trimesh, surfaces: LitMesh, points: Float64Array, normals: Float64Array, views: Sequence[View]
 ) -> BoolArray:
     """Return True for points (N,) that mirror little of the object itself, and that are flat within two pixels."""
     camera = views[0].camera

@@ -22,10 +22,7 @@ _ANNOTATIONS = {
     **{"panoptic": "panoptic", "poses": "poses"},
 }
 _MAPS = ("depth", "depth-sensor", "normals", "instances", "semantic", "panoptic")
-_FOLDERS = (
-    *("images", "labels", "layers", "annotations", "layouts", *_YOLO, *_MAPS),
-    *("flow", "bop", "colmap"),
-)
+_FOLDERS = (*("images", "labels", "layers", "annotations", "layouts", *_YOLO, *_MAPS), *("flow", "bop", "colmap"))
 """Folders that contain only files of a dataset."""
 _FOLD = re.compile(r"fold[0-9]+(_train|_val)?\.(txt|yaml)")
 

@@ -40,13 +40,7 @@ COMMAND_GROUPS: Mapping[str, Sequence[Callable[..., None]]] = {
         assets.import_,
         lights.lights,
     ),
-    "Make datasets": (
-        datasets.render,
-        datasets.settle,
-        datasets.merge,
-        datasets.split,
-        exports.export,
-    ),
+    "Make datasets": (datasets.render, datasets.settle, datasets.merge, datasets.split, exports.export),
     "Inspect": (
         inspection.view,
         inspection.preview,
@@ -55,15 +49,8 @@ COMMAND_GROUPS: Mapping[str, Sequence[Callable[..., None]]] = {
         inspection.report,
         inspection.chart,
     ),
-    "Train detectors": (
-        detectors.train,
-        detectors.evaluate,
-        detectors.compare,
-    ),
-    "Machine": (
-        machine.doctor,
-        machine.schema,
-    ),
+    "Train detectors": (detectors.train, detectors.evaluate, detectors.compare),
+    "Machine": (machine.doctor, machine.schema),
 }
 """Commands by heading of the help page, in the order of a typical workflow."""
 

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from mitsplat.dataset.write import DatasetSummary
-    from mitsplat.engine.ray import Cluster
     from mitsplat.progress import Progress
     from mitsplat.runtime.device import Device
     from mitsplat.scene.scene import Scene
@@ -144,10 +143,14 @@ def render(
             return
         from mitsplat.dataset.shard_file import Shard
         from mitsplat.dataset.write import write_dataset
+        from mitsplat.engine.ray import Cluster
         from mitsplat.scene.loading.scene_loading import load_scene
 
         part = None if shard is None else Shard.parse(shard)
-        cluster = _ray_cluster(address, resources, device) if engine == "ray" else None
+        cluster = None
+        if engine == "ray":
+            cluster = Cluster(address, None if resources is None else Cluster.parse_resources(resources))
+            cluster.on_device(device)  # raises if the device contradicts the cluster's resources
         if tolerance is not None:
             if quality is not None:
                 raise InputError("--quality and --tolerance both select the preset: give only one")
@@ -187,19 +190,6 @@ def _refuse_ineffective(given: set[str], scene: Path, *, only: int | None, engin
         refuse_options(given, f"the Mitsuba scene {scene}, which has its own size, seed and quality")
     elif is_usd(scene):
         refuse_options(given - {"--frames", "--size", "--format", "--quality", "--overwrite"}, f"the USD stage {scene}")
-
-
-def _ray_cluster(address: str | None, resources: str | None, device: str | None) -> Cluster:
-    """Return a Ray cluster whose resources match the device.
-
-    Raises:
-        InputError: If they do not.
-    """
-    from mitsplat.engine.ray import Cluster
-
-    cluster = Cluster(address, None if resources is None else Cluster.parse_resources(resources))
-    cluster.on_device(device)
-    return cluster
 
 
 def _fastest_preset(

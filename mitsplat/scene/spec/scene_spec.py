@@ -193,38 +193,11 @@ class SceneSpec(StrictModel):
 
     @model_validator(mode="after")
     def _check(self) -> SceneSpec:
-        seen: set[str] = set()
-        for position, shape in enumerate(self.shapes):
-            if shape.name in seen:
-                raise FieldError(("shapes", position, "name"), f"must be unique (got {shape.name!r} again)")
-            seen.add(shape.name)
-            if self.backdrop is not None and shape.name.startswith(BACKDROP):
-                text = f"must not begin with {BACKDROP!r} if the scene has a backdrop (got {shape.name!r})"
-                raise FieldError(("shapes", position, "name"), text)
-        if self.camera.motion is not None and self.conveyor is None:
-            raise FieldError(("camera", "motion"), "needs a conveyor")
-        boxes = [shape.name for shape in self.shapes if shape.box is not None]
-        if self.conveyor is not None and self.conveyor.belt not in boxes:
-            named, got = ", ".join(boxes) or "none", self.conveyor.belt
-            raise FieldError(("conveyor", "belt"), f"must be the name of a box among the shapes, {named} (got {got})")
-        for number, shape in enumerate(self.shapes):
-            if self.conveyor is not None and shape.name == self.conveyor.belt and shape.is_drawn:
-                key = "jitter" if shape.is_jittered else "share"
-                raise FieldError(("shapes", number, key), "must not be given for the belt of a conveyor")
-        environment_lights = [
-            i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)
-        ]
+        self._check_shapes()
+        self._check_conveyor()
         if self.environment == ():
             raise FieldError("environment", "must name at least one asset (got [])")
-        if len(environment_lights) > 1:
-            raise FieldError(
-                ("lights", environment_lights[1], "kind"),
-                "must not be a second environment light (room lights include one)",
-            )
-        if self.lights and not any(isinstance(light, RoomLight) or light.always_present for light in self.lights):
-            raise FieldError(
-                ("lights", 0, "draw", "count"), "must be at least 1 if no other light is in every frame (got 0)"
-            )
+        self._check_lights()
         if "depth-sensor" in self.output.formats and self.depth_sensor is None:
             raise FieldError(("output", "formats"), "depth-sensor needs the key depth_sensor")
         distorted = not (self.output.rectify or self.camera.intrinsics.is_pinhole)
@@ -243,6 +216,42 @@ class SceneSpec(StrictModel):
             raise FieldError("hold_out", "needs a test split: set output.test > 0")
         self._check_regions()
         return self
+
+    def _check_shapes(self) -> None:
+        """Refuse names that occur twice or that belong to a backdrop."""
+        seen: set[str] = set()
+        for position, shape in enumerate(self.shapes):
+            if shape.name in seen:
+                raise FieldError(("shapes", position, "name"), f"must be unique (got {shape.name!r} again)")
+            seen.add(shape.name)
+            if self.backdrop is not None and shape.name.startswith(BACKDROP):
+                text = f"must not begin with {BACKDROP!r} if the scene has a backdrop (got {shape.name!r})"
+                raise FieldError(("shapes", position, "name"), text)
+
+    def _check_conveyor(self) -> None:
+        """Refuse a conveyor without a belt, a belt that varies, and motion of the camera without a conveyor."""
+        if self.conveyor is None:
+            if self.camera.motion is not None:
+                raise FieldError(("camera", "motion"), "needs a conveyor")
+            return
+        belt, boxes = self.conveyor.belt, [shape.name for shape in self.shapes if shape.box is not None]
+        if belt not in boxes:
+            named = ", ".join(boxes) or "none"
+            raise FieldError(("conveyor", "belt"), f"must be the name of a box among the shapes, {named} (got {belt})")
+        for number, shape in enumerate(self.shapes):
+            if shape.name == belt and shape.is_drawn:
+                key = "jitter" if shape.is_jittered else "share"
+                raise FieldError(("shapes", number, key), "must not be given for the belt of a conveyor")
+
+    def _check_lights(self) -> None:
+        """Refuse two environment lights, and frames without any light."""
+        skies = [i for i, light in enumerate(self.lights) if isinstance(light, EnvironmentLight | RoomLight)]
+        if len(skies) > 1:
+            text = "must not be a second environment light (room lights include one)"
+            raise FieldError(("lights", skies[1], "kind"), text)
+        if self.lights and not any(isinstance(light, RoomLight) or light.always_present for light in self.lights):
+            text = "must be at least 1 if no other light is in every frame (got 0)"
+            raise FieldError(("lights", 0, "draw", "count"), text)
 
     def _check_focal_length(self) -> None:
         """Refuse focal lengths that are not in pixels."""

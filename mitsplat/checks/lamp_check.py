@@ -15,7 +15,7 @@ from mitsplat.runtime.dropped_rays import check_dropped_rays
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.planning.frame_lights import lights_at
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec.light_spec import EnvironmentLight
+from mitsplat.scene.spec.light_spec import EnvironmentLight, RoomLight
 
 DRAWS = 64
 """Number of layouts whose lamps are checked."""
@@ -39,7 +39,10 @@ def check_lamps(scene: Scene) -> Iterator[Finding]:
         hidden = float(_blocked(surfaces, reference_point(scene), np.array([lamp.position for lamp in lamps])).mean())
         if hidden > MAX_HIDDEN:
             text = f"lights[{number}]: the environment hides {hidden:.0%} of these lamps from the objects"
-            yield Finding("light", False, text, "limit draw.azimuth or draw.position to the sides without walls")
+            remedy = "limit draw.azimuth or draw.position to the sides without walls"
+            if isinstance(entry, RoomLight):
+                remedy = "choose a smaller size, or area lights with draw.azimuth on the sides without walls"
+            yield Finding("light", False, text, remedy)
 
 
 def _blocked(surfaces: mi.Scene, start: tuple[float, float, float], ends: Float64Array) -> BoolArray:

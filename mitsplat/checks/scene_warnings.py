@@ -15,6 +15,7 @@ from mitsplat.engine.resources import unused_memory
 from mitsplat.findings import Finding
 from mitsplat.frames.budget import worker_memory
 from mitsplat.geometry.camera import Camera
+from mitsplat.scene.planning.frame_lights import expand_rooms
 from mitsplat.scene.planning.frame_plan import FramePlan, plan_frame
 from mitsplat.scene.planning.lens_warnings import lens_warnings
 from mitsplat.scene.planning.unit_warnings import unit_warnings
@@ -75,7 +76,7 @@ def _light_warnings(scene: Scene, drawn: Set[LocalLight]) -> Iterator[Finding]:
         if not light.has_drawn_position and (name := enclosing_shape(scene, np.array(light.position))):
             text = f"lights[{number}] is inside of shape {name!r}"
             yield fault("lights", text, "move it out: it lights nothing")
-    if any(light.has_drawn_position for light in local.values()):
+    if any(isinstance(light, LocalLight) and light.has_drawn_position for light in expand_rooms(scene.spec)):
         names = [name for light in drawn if (name := enclosing_shape(scene, np.array(light.position)))]
         if names:
             text = f"{len(names)} of {len(drawn)} drawn lights lie inside a shape, such as {names[0]!r}"

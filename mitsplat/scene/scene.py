@@ -26,8 +26,7 @@ class Scene:
     """Scene specification with all files that it names.
 
     Attributes:
-        spec: Specification of the scene file. Enclosures are expanded to shapes, rooms to lights, and patterns to
-            lists.
+        spec: Specification of the scene file. Enclosures are expanded to shapes, and patterns to lists.
         path: Path of the scene file. For a scene made in Python, a path in its folder at which no file exists.
         environments: Environments, of which each layout draws one; empty if there are none.
         assets: Assets of each entry of ``spec.objects`` in turn, one per scale, with the class name of the entry.

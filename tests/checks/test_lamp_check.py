@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from mitsplat.checks.lamp_check import check_lamps
+from mitsplat.findings import Finding
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.conftest import WriteScene, box_asset
 
@@ -42,3 +43,15 @@ def test_lamps_behind_a_wall_are_reported(
     assert (finding is not None) == hidden
     if finding is not None:
         assert not finding.ok and finding.text.startswith("lights[1]: the environment hides ")
+
+
+def test_a_room_counts_as_the_entry_that_it_is_in_the_file(scene_data: dict[str, Any], write_scene: WriteScene) -> None:
+    def findings(*lights: dict[str, Any]) -> list[Finding]:
+        scene = load_scene(write_scene(scene_data | {"lights": list(lights)}))
+        return list(check_lamps(replace(scene, environments=(replace(box_asset("room"), mesh=WALL),))))
+
+    small, large = {"kind": "room", "size": 0.6}, {"kind": "room", "size": 6}
+    (behind,) = findings(small, {"kind": "point", "position": [0, 1, 0.5]})
+    assert behind.text.startswith("lights[1]: the environment hides 100% ") and "draw.azimuth" in behind.remedy
+    (room,) = findings(large)
+    assert room.text.startswith("lights[0]: the environment hides ") and room.remedy.startswith("choose a smaller size")

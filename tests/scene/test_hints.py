@@ -133,6 +133,17 @@ def test_commands_refuse_misspelt_formats_and_other_files_with_a_hint(
             "lights[0]: it is 1500 m away",
             "millimetres?",
         ),
+        ({"lights": [{"kind": "room", "size": 3400}]}, "lights[0].size: it is 3400 m", "millimetres?"),
+        (
+            {"lights": [{"kind": "room", "around": [0, -400, 300]}]},
+            "lights[0].around: it is 500 m away",
+            "millimetres?",
+        ),
+        (
+            {"lights": [{"kind": "room"}, {"kind": "point", "position": [0, 0, 1500], "intensity": 3}]},
+            "lights[1]: it is 1500 m away",
+            "millimetres?",
+        ),
         (
             {"lights": [{"kind": "environment", "colour": [255, 240, 230]}]},
             "lights[0].colour: its factors are up to 255",

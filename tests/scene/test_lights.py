@@ -120,7 +120,7 @@ def test_drawing_a_light_does_not_change_other_draws(lit: Any) -> None:
 
 def test_a_room_has_a_window_lamps_and_walls(lit: Any) -> None:
     scene = lit({"kind": "room", "around": [1, 0, 0.5], "size": 2})
-    assert [light.kind for light in scene.spec.lights] == ["area", "area", "environment"]
+    assert [light.kind for light in scene.spec.lights] == ["room"]  # messages and hashes use the file's own entries
     drawn = lights_of(scene)
     assert {len(lights) for lights in drawn} == {3, 4, 5}
     for window, *lamps, walls in drawn:
@@ -157,6 +157,10 @@ def test_lights_that_may_be_inside_of_a_shape_get_a_warning(lit: Any) -> None:
     table = {"name": "table", "box": {"size": [1, 1, 0.1], "position": [0, 0, -0.05]}}
     lamp = {"kind": "point", "draw": {"position": [[-0.4, -0.4, 4.6], [0.4, 0.4, 7]]}}
     found = [finding.text for finding in scene_warnings(lit(lamp, shapes=[table, block])) if finding.name == "lights"]
+    assert len(found) == 1 and "drawn lights lie inside a shape, such as 'block'" in found[0]
+    hall = block | {"box": {"size": [9, 9, 9], "position": [0, 0, 5]}}
+    room = {"kind": "room", "around": [0, 0, 5]}
+    found = [finding.text for finding in scene_warnings(lit(room, shapes=[table, hall])) if finding.name == "lights"]
     assert len(found) == 1 and "drawn lights lie inside a shape, such as 'block'" in found[0]
 
 

@@ -15,7 +15,6 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.scene.loading.references import LoadedFiles, errors_at_key, expand_patterns, load_files, shape_mesh
 from mitsplat.scene.planning.conveyor import check_belt
-from mitsplat.scene.planning.frame_lights import expand_rooms
 from mitsplat.scene.planning.viewpoints import camera_at
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.named_files import environments, object_assets
@@ -84,8 +83,6 @@ def _build_scene(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:
         surroundings = tuple(map(_check_units, named.environments))
     assets = _sized_objects(spec, path, named)
     spec, shape_meshes = _expand_enclosures(spec, named, assets)
-    if (lights := expand_rooms(spec)) != spec.lights:
-        spec = spec.model_copy(update={"lights": lights})
     return Scene(
         spec=spec,
         path=path,

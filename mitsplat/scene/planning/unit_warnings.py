@@ -8,7 +8,7 @@ import numpy as np
 
 from mitsplat.findings import Finding
 from mitsplat.scene.spec.camera_spec import CameraHemisphere, CameraOrbit, CameraPath
-from mitsplat.scene.spec.light_spec import DrawnLight, EnvironmentLight, LocalLight, SpotLight
+from mitsplat.scene.spec.light_spec import DrawnLight, EnvironmentLight, LocalLight, RoomLight, SpotLight
 from mitsplat.scene.spec.scene_spec import SceneSpec
 
 MAX_REGION = 20.0
@@ -46,6 +46,13 @@ def unit_warnings(spec: SceneSpec) -> Iterator[Finding]:
         if isinstance(light, LocalLight | EnvironmentLight) and max(light.colour) > MAX_COLOUR:
             text = f"lights[{number}].colour: its factors are up to {max(light.colour):g}"
             yield Finding("lights", False, text, "is it a colour from 0 to 255? Divide it by 255")
+        if isinstance(light, RoomLight):
+            if light.size > MAX_ROOM:
+                text = f"lights[{number}].size: it is {light.size:.4g} m"
+                yield Finding("lights", False, text, "is it in millimetres?")
+            if (away := float(np.linalg.norm(light.around))) > MAX_LIGHT:
+                text = f"lights[{number}].around: it is {away:.4g} m away"
+                yield Finding("lights", False, text, "is it in millimetres?")
     yield from _length_warnings(spec)
     yield from _time_warnings(spec)
     yield from _angle_warnings(spec)

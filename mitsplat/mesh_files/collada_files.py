@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 from urllib.parse import unquote
 from xml.etree import ElementTree
 
@@ -16,6 +16,12 @@ import numpy as np
 from mitsplat.errors import InputError
 from mitsplat.mesh_files.mesh_file import OPAQUE, Axis, Material, phong_gloss
 from mitsplat.mesh_files.obj_files import check_texture
+
+if TYPE_CHECKING:
+    import collada
+    from collada.material import Effect
+    from collada.primitive import Primitive
+    from collada.scene import MaterialNode, SceneNode
 
 _NAMESPACE = "{*}"
 _LOST_NODE = re.compile(
@@ -63,12 +69,8 @@ def plain_name(uri: str) -> str:
     return name[1:] if name[2:3] == ":" else name  # file:///C:/a.png
 
 
-def check_collada(path: Path, document: Any) -> None:
+def check_collada(path: Path, document: collada.Collada) -> None:
     """Refuse a COLLADA file with data that trimesh leaves out.
-
-    Args:
-        path: The file.
-        document: The ``collada.Collada`` of the file.
 
     Raises:
         InputError: If it has controllers, a mesh in a frame that trimesh gets wrong, or a texture that is missing, has
@@ -91,7 +93,7 @@ def check_collada(path: Path, document: Any) -> None:
             _check_coordinates(material, primitive)
 
 
-def _bindings(nodes: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
+def _bindings(nodes: Iterable[SceneNode]) -> Iterator[tuple[MaterialNode | None, Primitive]]:
     """Yield each primitive of nodes of pycollada after its material node, which is None if its symbol is not bound."""
     for node in nodes:
         if (geometry := getattr(node, "geometry", None)) is not None:
@@ -100,7 +102,7 @@ def _bindings(nodes: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
         yield from _bindings(getattr(node, "children", None) or ())
 
 
-def _check_coordinates(material: Any, primitive: Any) -> None:
+def _check_coordinates(material: MaterialNode, primitive: Primitive) -> None:
     """Refuse a texture that trimesh puts elsewhere than its material node.
 
     Raises:
@@ -125,12 +127,12 @@ def _check_coordinates(material: Any, primitive: Any) -> None:
             )
 
 
-def lost_node(document: Any) -> str | None:
+def lost_node(document: collada.Collada) -> str | None:
     """Return the reason why a node of the scene of a ``collada.Collada`` was left out, or None if all were read."""
     return next((str(error.msg) for error in document.errors if _LOST_NODE.match(error.msg)), None)
 
 
-def collada_effects(document: Any) -> list[Any]:
+def collada_effects(document: collada.Collada) -> list[Effect | None]:
     """Return the effect of each group of faces of a ``collada.Collada``, in the order of trimesh; None without one."""
     from collada import polylist, triangleset  # optional
 
@@ -141,7 +143,7 @@ def collada_effects(document: Any) -> list[Any]:
     ]
 
 
-def with_gloss(material: Material, effect: Any) -> Material:
+def with_gloss(material: Material, effect: Effect) -> Material:
     """Return a material with the highlight of an effect, which trimesh leaves out.
 
     ``lambert`` and ``constant`` have none. Mirrored surroundings (``reflective``) are left out with a warning.
@@ -161,7 +163,7 @@ def with_gloss(material: Material, effect: Any) -> Material:
     )
 
 
-def _mean(value: Any) -> float | None:
+def _mean(value: object) -> float | None:
     """Return the mean of a colour without its opacity, or a number; 0 if it is absent and None if it is a texture."""
     if value is None:
         return 0.0
@@ -171,7 +173,7 @@ def _mean(value: Any) -> float | None:
         return None
 
 
-def collada_warnings(document: Any) -> Iterator[str]:
+def collada_warnings(document: collada.Collada) -> Iterator[str]:
     """Yield a warning about each kind of data of a COLLADA file that is not read, for its ``collada.Collada``."""
     if any("COLOR" in one.sources and one.sources["COLOR"] for mesh in document.geometries for one in mesh.primitives):
         yield "the colours of its vertices are left out"
@@ -182,7 +184,7 @@ def collada_warnings(document: Any) -> Iterator[str]:
         yield f"its material symbol {symbol} has no material (instance_material): grey is used"
 
 
-def _texture_of(material: Any) -> str | None:
+def _texture_of(material: collada.material.Material) -> str | None:
     """Return the image that a material names as its diffuse colour, or None."""
     try:
         return str(material.effect.diffuse.sampler.surface.image.path)
@@ -190,7 +192,7 @@ def _texture_of(material: Any) -> str | None:
         return None
 
 
-def _opacity(effect: Any) -> float:
+def _opacity(effect: Effect) -> float:
     """Return the opacity of an effect; 1 if a texture states it."""
     factor, colour = effect.transparency, effect.transparent
     try:

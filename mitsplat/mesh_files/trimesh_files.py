@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
@@ -31,6 +31,9 @@ from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import MAX_FRACTION, PAINTED_MATERIAL, UNKNOWN_MATERIAL, FilePart, Material, MeshFile
 from mitsplat.mesh_files.obj_files import check_obj_materials, check_texture, obj_warnings, plain_text, values_of
 from mitsplat.mesh_files.trimesh_parts import scene_parts
+
+if TYPE_CHECKING:
+    import collada
 
 _MAX_HEADER_BYTES = 1 << 16
 """Maximum size of the header of a PLY file [bytes]."""
@@ -181,7 +184,7 @@ def _check_elements(header: str) -> None:
     raise InputError("a mesh needs at least one face (got points only): reconstruct a surface, or export it with faces")
 
 
-def _collada_document(path: Path) -> Any:
+def _collada_document(path: Path) -> collada.Collada:
     import collada  # optional
 
     document = collada.Collada(str(path), ignore=[collada.DaeError])
@@ -291,7 +294,9 @@ class _Resolver(FilePathResolver):  # type: ignore[misc]
         return plain_text(found.read_bytes())
 
 
-def _polygons(path: Path, scene: trimesh.Scene, document: Any) -> Iterator[tuple[Any, Any]]:
+def _polygons(
+    path: Path, scene: trimesh.Scene, document: collada.Collada | None
+) -> Iterator[tuple[Float64Array, Sequence[Polygon]]]:
     """Yield the positions and the vertices of the polygons of a file, in formats whose polygons trimesh splits."""
     kind = path.suffix.lower()
     if kind == ".ply":
@@ -308,7 +313,7 @@ def _polygons(path: Path, scene: trimesh.Scene, document: Any) -> Iterator[tuple
         _, rows, count, number = _off_rows(path)
         faces = [row[1 : int(row[0]) + 1] for row in rows[count + 1 : count + number + 1]]
         yield np.array([row[:3] for row in rows[1 : count + 1]], dtype=np.float64), [[*map(int, f)] for f in faces]
-    elif kind == ".dae":
+    elif document is not None:
         for geometry in document.geometries:
             for one in geometry.primitives:
                 if hasattr(one, "polystarts"):

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -34,7 +33,7 @@ from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import file_hash
-from mitsplat.storage.files import write_file, write_text
+from mitsplat.storage.files import JsonObject, write_file, write_text
 
 MIN_PHOTOS = 3
 
@@ -210,7 +209,7 @@ def _find_copies(hashes: Mapping[str, str]) -> list[str]:
     return [name for name, content in hashes.items() if first[content] != name]
 
 
-def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> dict[str, Any]:
+def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> JsonObject:
     """Return the inputs of a capture as JSON values: hashes of file contents, without absolute paths."""
     given = {name: getattr(settings, name) for name in ("poses", "masks", "mask_model")}
     kept = {name: value for name, value in asdict(settings).items() if name not in ("frames", *given)}
@@ -222,7 +221,7 @@ def _inputs(photos: Path, files: Sequence[Path], settings: CaptureSettings) -> d
     }
 
 
-def _load_finished(out: Path, inputs: dict[str, Any]) -> CaptureResult | None:
+def _load_finished(out: Path, inputs: JsonObject) -> CaptureResult | None:
     """Return the result stored in ``out`` if it has the same inputs, else None."""
     try:
         record = json.loads((out / _INPUTS).read_text())
@@ -236,7 +235,7 @@ def _load_finished(out: Path, inputs: dict[str, Any]) -> CaptureResult | None:
         return None
 
 
-def _delete_outdated(out: Path, inputs: dict[str, Any], settings: CaptureSettings) -> None:
+def _delete_outdated(out: Path, inputs: JsonObject, settings: CaptureSettings) -> None:
     """Delete masks, and delete copies and matches of other photographs or other settings."""
     way = settings.max_size, settings.poses is None, settings.undistorted
     marker = json.dumps([inputs["photos"], *way], sort_keys=True)

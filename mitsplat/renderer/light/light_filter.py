@@ -307,9 +307,8 @@ class LightFilter:
             return step + 1, weights + weight, squares, *changed
 
         own_weight = dr.select(self.here.known, mi.Float(1), GUESS_WEIGHT)
-        state = dr.zeros(mi.UInt32, width), own_rays * own_weight, own_rays * own_weight * own_weight
         sums = [dr.zeros(mi.Float, width) for _ in values]
-        state = *state, *sums
+        state = dr.zeros(mi.UInt32, width), own_rays * own_weight, own_rays * own_weight * own_weight, *sums
         _, weights, squares, *sums = dr.while_loop(state, lambda step, *_: step < 2 * last, add, label="light filter")
         averages = [own + total / weights for own, total in zip(values, sums, strict=True)]
         return averages, weights * weights / (squares * own_rays)

@@ -97,11 +97,8 @@ def _focal_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tuple[s
         cause = "is fx of a larger image? Then state its size; a pixel is not a micrometre"
         yield f"fx = {fx:g} px is a field of view of {fov:.3g} degrees in an image of {full[0]} px", cause
     if max(fx / fy, fy / fx) > MAX_OBLONG:
-        ratio = f"fx = {fx:g} and fy = {fy:g} differ by a factor of {max(fx / fy, fy / fx):.3g}"
-        yield (
-            ratio,
-            "is one of them of another image size, or is fy a value of cx or cy? Most cameras have square pixels",
-        )
+        cause = "is one of them of another image size, or is fy a value of cx or cy? Most cameras have square pixels"
+        yield f"fx = {fx:g} and fy = {fy:g} differ by a factor of {max(fx / fy, fy / fx):.3g}", cause
     if lens.lens == "opencv" and fov > FOV[1]:
         yield f"the field of view is {fov:.4g} degrees", "does the camera have a fisheye lens? Then state lens: fisheye"
 
@@ -123,11 +120,9 @@ def _distortion_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tu
         angle = float(np.arctan(slopes.max()))
         ratio = float(shown[int(np.argmax(slopes))]) / np.sin(angle)
         if ratio < MIN_SINE:
-            yield (
-                f"distortion places rays at {np.degrees(angle):.3g} degrees nearer to the middle, by {1 - ratio:.0%}, "
-                "than an orthographic fisheye lens does",
-                "are they coefficients of lens: opencv?",
-            )
+            where = f"at {np.degrees(angle):.3g} degrees nearer to the middle, by {1 - ratio:.0%}"
+            text = f"distortion places rays {where}, than an orthographic fisheye lens does"
+            yield text, "are they coefficients of lens: opencv?"
             return
     if stretch > MAX_STRETCH:
         yield f"distortion moves the corners of the image by a factor of {stretch:.3g}", cause

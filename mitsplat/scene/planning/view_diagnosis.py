@@ -77,10 +77,8 @@ def _candidates(pose: Float64Array, *, far: bool) -> Iterator[tuple[str, Float64
     unit = " in millimetres, and" if far else ""
     if far:
         yield "is its position in millimetres?", metric
-    yield (
-        f"is its matrix{unit} in the axes of OpenGL (y up, z backwards), for Camera.from_opengl?",
-        metric @ OPENCV_FROM_OPENGL,
-    )
+    cause = f"is its matrix{unit} in the axes of OpenGL (y up, z backwards), for Camera.from_opengl?"
+    yield cause, metric @ OPENCV_FROM_OPENGL
     yield f"is its matrix{unit} the inverse, camera_from_world?", np.asarray(np.linalg.inv(metric), np.float64)
     both = np.asarray(np.linalg.inv(OPENCV_FROM_OPENGL @ metric), np.float64)
     yield f"is its matrix{unit} the inverse, in the axes of OpenGL (y up, z backwards)?", both

@@ -40,12 +40,12 @@ class BandRates(NamedTuple):
     Attributes:
         constant: Rate of the constant coefficients.
         rest: Rate of the others.
-        bands: Number of coefficients per channel.
+        sh_count: Number of coefficients per channel.
     """
 
     constant: float
     rest: float
-    bands: int
+    sh_count: int
 
 
 Rate = float | BandRates
@@ -77,11 +77,11 @@ class Adam:
         """Make one optimiser step, with a learning rate per parameter."""
         self.steps += 1
         unbias = np.sqrt(1 - _BETA_2**self.steps) / (1 - _BETA_1**self.steps)
-        bands: dict[str, int] = {}
+        sh_count: dict[str, int] = {}
         pairs: list[float] = []
         for name in self.values:
             rate = rates[name]
-            bands[name] = rate.bands if isinstance(rate, BandRates) else 1
+            sh_count[name] = rate.sh_count if isinstance(rate, BandRates) else 1
             if isinstance(rate, BandRates):
                 pairs += [float(np.float32(value) * np.float32(unbias)) for value in (rate.constant, rate.rest)]
             else:
@@ -90,7 +90,7 @@ class Adam:
         gradients = {name: dr.grad(value) for name, value in self.values.items()}
         values = dr.detach(self.values)
         dr.eval(gradients, values)
-        self.values, self.first, self.second = _adam_step(values, gradients, self.first, self.second, numbers, bands)
+        self.values, self.first, self.second = _adam_step(values, gradients, self.first, self.second, numbers, sh_count)
 
     def take(self, rows: npt.NDArray[np.uint32], widths: Mapping[str, int], fresh: BoolArray) -> None:
         """Replace the parameters by a selection of their rows.
@@ -134,7 +134,7 @@ class Adam:
 
 @recorded
 def _adam_step(
-    values: _Arrays, gradients: _Arrays, first: _Arrays, second: _Arrays, rates: mi.Float, bands: dict[str, int]
+    values: _Arrays, gradients: _Arrays, first: _Arrays, second: _Arrays, rates: mi.Float, sh_count: dict[str, int]
 ) -> tuple[_Arrays, _Arrays, _Arrays]:
     """Return parameters and moments after a step.
 
@@ -146,8 +146,8 @@ def _adam_step(
         # The derivative is undefined exactly in the camera plane; a NaN would stay in the moments.
         gradient = dr.select(dr.isfinite(gradient), gradient, 0)
         rate = number(rates, 2 * place)
-        if bands[name] > 1:
-            element = dr.arange(mi.UInt32, dr.width(value)) % (3 * bands[name])
+        if sh_count[name] > 1:
+            element = dr.arange(mi.UInt32, dr.width(value)) % (3 * sh_count[name])
             rate = dr.select(element < 3, rate, number(rates, 2 * place + 1))
         first[name] = dr.lerp(gradient, first[name], _BETA_1)
         second[name] = dr.lerp(gradient * gradient, second[name], _BETA_2)
@@ -163,11 +163,11 @@ class GaussianModel(Adam):
 
     Attributes:
         unit: Length [m] that makes learning rates independent of the size of the scene.
-        bands: SH coefficients per channel.
+        sh_count: SH coefficients per channel.
     """
 
     def __init__(self, splats: Splats, unit: float) -> None:
-        self.unit, self.bands = unit, splats.sh.shape[1]
+        self.unit, self.sh_count = unit, splats.sh.shape[1]
         opacities = np.clip(splats.opacities.astype(np.float64), 1e-4, 1 - 1e-4)
         super().__init__(
             {
@@ -187,7 +187,7 @@ class GaussianModel(Adam):
     @property
     def widths(self) -> dict[str, int]:
         """Floats per Gaussian, by parameter."""
-        return {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh": 3 * self.bands}
+        return {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh": 3 * self.sh_count}
 
     def activated(self) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float]:
         """Return means [m], quaternions, scales [m], opacities and SH coefficients as flat arrays.
@@ -198,7 +198,7 @@ class GaussianModel(Adam):
 
     def cloud(self) -> Cloud:
         """Return the Gaussians as a renderer cloud."""
-        return pack_cloud(*self.activated(), self.bands)
+        return pack_cloud(*self.activated(), self.sh_count)
 
     def render(self, eye: Eye, quality: Quality, *, depth: bool = False) -> RenderOp:
         """Render the Gaussians; :meth:`set_gradients` computes the gradients of the parameters.
@@ -211,7 +211,7 @@ class GaussianModel(Adam):
         Returns:
             The rendering; a :class:`~mitsplat.renderer.differentiation.backward.DepthRendering` if ``depth`` is True.
         """
-        found = _project(dr.detach(self.values), self._unit, eye.view.kind, eye.numbers, quality, self.bands)
+        found = _project(dr.detach(self.values), self._unit, eye.view.kind, eye.numbers, quality, self.sh_count)
         return render_records(*found, eye.view, quality, depth=depth)
 
     def set_gradients(
@@ -235,7 +235,7 @@ class GaussianModel(Adam):
         values = dr.detach(self.values)
         weights = on_device(opacity_weight, scale_weight)
         found = _gradients(
-            values, self._unit, eye.view.kind, eye.numbers, quality, self.bands, list(gradients), weights
+            values, self._unit, eye.view.kind, eye.numbers, quality, self.sh_count, list(gradients), weights
         )
         self.track()
         for name, gradient in found.items():
@@ -243,7 +243,7 @@ class GaussianModel(Adam):
 
     def sh_rates(self, rate: float, rest_rate: float) -> Rate:
         """Return the rates of ``sh``: one for the constant coefficients and another for the rest."""
-        return rate if self.bands == 1 else BandRates(rate, rest_rate, self.bands)
+        return rate if self.sh_count == 1 else BandRates(rate, rest_rate, self.sh_count)
 
     def splats(self) -> Splats:
         """Return the current Gaussians."""
@@ -253,7 +253,7 @@ class GaussianModel(Adam):
             quats=quats.reshape(-1, 4),
             scales=scales.reshape(-1, 3),
             opacities=opacities,
-            sh=sh.reshape(-1, self.bands, 3),
+            sh=sh.reshape(-1, self.sh_count, 3),
         )
 
     @cached_property
@@ -273,10 +273,10 @@ def _activated(values: _Arrays, unit: mi.Float) -> tuple[mi.Float, mi.Float, mi.
 
 @recorded
 def _project(
-    values: _Arrays, unit: mi.Float, kind: Kind, numbers: _Arrays, quality: Quality, bands: int
+    values: _Arrays, unit: mi.Float, kind: Kind, numbers: _Arrays, quality: Quality, sh_count: int
 ) -> tuple[mi.Float, mi.Float, mi.UInt32]:
     """Return the view records of Gaussians, their least depths and their tile boxes."""
-    records, least, box, _ = project_cloud(pack_cloud(*_activated(values, unit), bands), kind, numbers, quality)
+    records, least, box, _ = project_cloud(pack_cloud(*_activated(values, unit), sh_count), kind, numbers, quality)
     return records, least, box
 
 
@@ -287,7 +287,7 @@ def _gradients(
     kind: Kind,
     numbers: _Arrays,
     quality: Quality,
-    bands: int,
+    sh_count: int,
     found: list[mi.Float],
     weights: mi.Float,
 ) -> _Arrays:
@@ -296,5 +296,5 @@ def _gradients(
     dr.enable_grad(values)
     _, _, scales, opacities, _ = _activated(values, unit)
     dr.backward(dr.sum(opacities) * number(weights, 0) + dr.sum(scales) * number(weights, 1))
-    gather_gradients(pack_cloud(*_activated(values, unit), bands), kind, numbers, quality, sum(found[1:], found[0]))
+    gather_gradients(pack_cloud(*_activated(values, unit), sh_count), kind, numbers, quality, sum(found[1:], found[0]))
     return {name: dr.grad(value) for name, value in values.items()}

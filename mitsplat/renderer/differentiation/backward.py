@@ -265,7 +265,7 @@ def render_records(
 
 
 def pack_cloud(
-    means: mi.Float, quats: mi.Float, scales: mi.Float, opacities: mi.Float, sh: mi.Float, bands: int
+    means: mi.Float, quats: mi.Float, scales: mi.Float, opacities: mi.Float, sh: mi.Float, sh_count: int
 ) -> Cloud:
     """Pack differentiable parameters like :func:`mitsplat.renderer.projection.clouds.upload_cloud`.
 
@@ -275,7 +275,7 @@ def pack_cloud(
         scales: Flat N x 3.
         opacities: N.
         sh: Flat N x K x 3.
-        bands: K.
+        sh_count: K, the number of coefficients per channel.
     """
     count = dr.width(opacities)
     i = dr.arange(mi.UInt32, count)
@@ -283,17 +283,17 @@ def pack_cloud(
     mean, sigma = dr.gather(mi.Vector3f, means, i, mode=own), dr.gather(mi.Vector3f, scales, i, mode=own)
     quat = dr.normalize(mi.Vector4f(*dr.gather(mi.Array4f, quats, i, mode=own)))
     sigma = dr.maximum(sigma, SCALE_RATIO_MIN * dr.max(dr.detach(sigma)))
-    stride = -(-3 * bands // 4) * 4
+    stride = -(-3 * sh_count // 4) * 4
     geometry, padded = dr.zeros(mi.Float, Geometry.WIDTH * count), dr.zeros(mi.Float, 4 * count)
     dr.scatter(geometry, mi.ArrayXf([*mean, opacities, *quat]), i)
     dr.scatter(padded, mi.Array4f(sigma.x, sigma.y, sigma.z, 0), i)
     coefficients = sh
-    if stride != 3 * bands:
+    if stride != 3 * sh_count:
         coefficients = dr.zeros(mi.Float, stride * count)
-        j = dr.arange(mi.UInt32, 3 * bands * count)
-        row = j // (3 * bands)
-        dr.scatter(coefficients, sh, row * stride + (j - row * (3 * bands)))
-    return Cloud(count, geometry, padded, coefficients, bands, stride)
+        j = dr.arange(mi.UInt32, 3 * sh_count * count)
+        row = j // (3 * sh_count)
+        dr.scatter(coefficients, sh, row * stride + (j - row * (3 * sh_count)))
+    return Cloud(count, geometry, padded, coefficients, sh_count, stride)
 
 
 class _March(dr.CustomOp):

@@ -1,9 +1,8 @@
 """Materials of proxy surfaces at ray hits, derived from the Gaussians that the proxies represent.
 
 Every corner of every triangle has the mean material of the nearest Gaussians that are parallel to it, and hits
-interpolate between the corners.
-The parameters are those of Mitsuba's BSDF ``principled``. A surface without material parameters is diffuse, and its
-colour is the captured one.
+interpolate between the corners. The parameters are those of Mitsuba's BSDF ``principled``. A surface without material
+parameters is diffuse, and its colour is the captured one.
 """
 
 from __future__ import annotations

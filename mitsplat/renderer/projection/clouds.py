@@ -52,10 +52,10 @@ def upload_cloud(means: AnyArray, quats: AnyArray, scales: AnyArray, opacities: 
         opacities: Peak opacities, shape (N,).
         sh: Coefficients of the spherical harmonics of the colour, shape (N, K, 3).
     """
-    count, bands = len(means), sh.shape[1]
-    stride = -(-3 * bands // 4) * 4
+    count, sh_count = len(means), sh.shape[1]
+    stride = -(-3 * sh_count // 4) * 4
     padded = np.zeros((count, stride), np.float32)
-    padded[:, : 3 * bands] = sh.reshape(count, 3 * bands)
+    padded[:, : 3 * sh_count] = sh.reshape(count, 3 * sh_count)
     widest = scales.max(axis=1, keepdims=True) if count else scales[:, :1]
     sigma = np.zeros((count, 4), np.float32)
     sigma[:, :3] = np.maximum(scales, SCALE_RATIO_MIN * widest)
@@ -65,7 +65,8 @@ def upload_cloud(means: AnyArray, quats: AnyArray, scales: AnyArray, opacities: 
         opacities,
         quats,
     )
-    return Cloud(count, wrapped(mi.Float, geometry), wrapped(mi.Float, sigma), wrapped(mi.Float, padded), bands, stride)
+    rows, sigmas, coefficients = (wrapped(mi.Float, values) for values in (geometry, sigma, padded))
+    return Cloud(count, rows, sigmas, coefficients, sh_count, stride)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,9 +37,10 @@ import mitsuba as mi
 from mitsplat.renderer.projection.records import PlaneRecord
 
 LOG2_E_HALF = 0.5 * 1.4426950408889634
+"""Factor log2(e)/2 from a squared Mahalanobis distance to the binary logarithm of the response."""
 
 
-def evaluate_sh(direction: mi.Vector3f, coefficient: Callable[[int], list[mi.Float]], bands: int) -> list[mi.Float]:
+def evaluate_sh(direction: mi.Vector3f, coefficient: Callable[[int], list[mi.Float]], sh_count: int) -> list[mi.Float]:
     """Evaluate the display-encoded colour of Gaussians along unit vectors.
 
     The basis is that of 3DGS, real spherical harmonics (Kerbl et al. 2023).
@@ -48,13 +49,13 @@ def evaluate_sh(direction: mi.Vector3f, coefficient: Callable[[int], list[mi.Flo
         direction: Unit vector from the camera to the Gaussian, in the Gaussians' own frame. A rotated object therefore
             needs no rotation of its coefficients.
         coefficient: Function of the coefficient's index that returns its three channels.
-        bands: Number of coefficients to use, 1, 4, 9 or 16.
+        sh_count: Number of coefficients per channel, 1, 4, 9 or 16.
     """
     x, y, z = direction.x, direction.y, direction.z
     basis: list[mi.Float] = [0.28209479177387814]
-    if bands > 1:
+    if sh_count > 1:
         basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    if bands > 4:
+    if sh_count > 4:
         xx, yy, zz = x * x, y * y, z * z
         basis += [
             1.0925484305920792 * x * y,
@@ -63,7 +64,7 @@ def evaluate_sh(direction: mi.Vector3f, coefficient: Callable[[int], list[mi.Flo
             -1.0925484305920792 * x * z,
             0.5462742152960396 * (xx - yy),
         ]
-    if bands > 9:
+    if sh_count > 9:
         basis += [
             -0.5900435899266435 * y * (3 * xx - yy),
             2.890611442640554 * x * y * z,
@@ -137,19 +138,17 @@ class Response:
         inverse = dr.rcp(det)
         p11, p12, p21, p22 = (1 + s) * inverse, -q * inverse, -r * inverse, (1 + p) * inverse
         g, h, i = self.g, 0.5 * self.h, self.i
-        response = Response(
-            self.u0,
-            self.v0,
-            (self.a + self.det * k22) * inverse,
-            2 * (b - self.det * k12) * inverse,
-            (self.c + self.det * k11) * inverse,
-            p11 * self.e + p12 * self.f,
-            p21 * self.e + p22 * self.f,
-            p11 * (p11 * g + p12 * h) + p12 * (p11 * h + p12 * i),
-            2 * (p11 * (p21 * g + p22 * h) + p12 * (p21 * h + p22 * i)),
-            p21 * (p21 * g + p22 * h) + p22 * (p21 * h + p22 * i),
-            self.depth,
-            self.det * inverse,
+        response = replace(
+            self,
+            a=(self.a + self.det * k22) * inverse,
+            b2=2 * (b - self.det * k12) * inverse,
+            c=(self.c + self.det * k11) * inverse,
+            e=p11 * self.e + p12 * self.f,
+            f=p21 * self.e + p22 * self.f,
+            g=p11 * (p11 * g + p12 * h) + p12 * (p11 * h + p12 * i),
+            h=2 * (p11 * (p21 * g + p22 * h) + p12 * (p21 * h + p22 * i)),
+            i=p21 * (p21 * g + p22 * h) + p22 * (p21 * h + p22 * i),
+            det=self.det * inverse,
         )
         return response, det
 
@@ -201,18 +200,18 @@ def project_gaussian(gaussian: PlacedGaussian) -> Response:
     c1, c2 = dr.cross(w0, w1), dr.cross(w0, w2)
     gain = dr.square(depth / thinnest) * n0
     return Response(
-        u0,
-        v0,
-        gain * dr.squared_norm(c1),
-        2 * gain * dr.dot(c1, c2),
-        gain * dr.squared_norm(c2),
-        2 * n0 * dr.dot(w0, w1),
-        2 * n0 * dr.dot(w0, w2),
-        n0 * dr.squared_norm(w1),
-        2 * n0 * dr.dot(w1, w2),
-        n0 * dr.squared_norm(w2),
-        depth * gaussian.scale,
-        dr.square(gain * dr.dot(w0, dr.cross(w1, w2))) * dr.squared_norm(w0),
+        u0=u0,
+        v0=v0,
+        a=gain * dr.squared_norm(c1),
+        b2=2 * gain * dr.dot(c1, c2),
+        c=gain * dr.squared_norm(c2),
+        e=2 * n0 * dr.dot(w0, w1),
+        f=2 * n0 * dr.dot(w0, w2),
+        g=n0 * dr.squared_norm(w1),
+        h=2 * n0 * dr.dot(w1, w2),
+        i=n0 * dr.squared_norm(w2),
+        depth=depth * gaussian.scale,
+        det=dr.square(gain * dr.dot(w0, dr.cross(w1, w2))) * dr.squared_norm(w0),
     )
 
 

@@ -286,8 +286,8 @@ class Projector:
 
     def _colour(self, mean: mi.Vector3f, local: mi.UInt32) -> list[mi.Float]:
         clouds = self.clouds
-        bands = min(clouds.sh_count, (self.quality.sh_degree + 1) ** 2)
-        floats = -(-3 * bands // 4) * 4
+        sh_count = min(clouds.sh_count, (self.quality.sh_degree + 1) ** 2)
+        floats = -(-3 * sh_count // 4) * 4
         base = local * (clouds.sh_stride // 4)
         packets = [dr.gather(mi.Array4f, clouds.sh, base + j, mode=_ADJOINT) for j in range(floats // 4)]
 
@@ -296,7 +296,7 @@ class Projector:
 
         # A Gaussian centred on the camera has no direction, so only its constant band counts.
         direction = mean * dr.rsqrt(dr.maximum(dr.squared_norm(mean), 1e-30))
-        return evaluate_sh(direction, coefficient, bands)
+        return evaluate_sh(direction, coefficient, sh_count)
 
 
 @recorded

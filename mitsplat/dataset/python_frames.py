@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 from mitsplat.arguments import check_type, path_of
@@ -18,8 +19,7 @@ from mitsplat.frames.frame import Frame
 from mitsplat.frames.sequence import with_successor
 from mitsplat.runtime.device import current_device
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec.scene_spec import Output
-from mitsplat.scene.splits import split_of
+from mitsplat.scene.splits import Split, split_of
 from mitsplat.storage.files import storage_errors, write_text
 
 
@@ -30,10 +30,11 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
 
         ms.write_frames(scene, "out/film", ms.render_frames(scene, layouts=simulate(), cameras=camera))
 
-    Frames are numbered in the order of the iterable. Each frame counts as a layout of its own, which determines its
-    split. The audit compares pictures, labels, layouts and cameras of such a dataset with each other, but not cameras
-    with the scene. An interrupted run cannot be resumed. A frame has a file of its flow if this leads to the next frame
-    of the iterable, as in a film of :func:`mitsplat.render_frames`.
+    Frames are numbered in the order of the iterable. Each frame counts as a layout of its own. Frames of equal poses,
+    such as those of several cameras, are of one split, which the number of different poses before them determines. The
+    audit compares pictures, labels, layouts and cameras of such a dataset with each other, but not cameras with the
+    scene. An interrupted run cannot be resumed. A frame has a file of its flow if this leads to the next frame of the
+    iterable, as in a film of :func:`mitsplat.render_frames`.
 
     Args:
         scene: Scene of all frames; image size and formats are in ``scene.spec``.
@@ -59,7 +60,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
     catalogue = Catalogue.of(scene)
     device = current_device().kind
     content = content_of(one_view, catalogue, device) | {"given": True}
-    counts = FrameCounts()
+    counts, splits = FrameCounts(), dict[bytes, Split]()
     with open_folder(out, content, scene.path, None, resume=False, overwrite=overwrite) as manifest:
         append_run(out, 1, device)
         pairs = with_successor(frames) if "flow" in output.formats else ((frame, None) for frame in frames)
@@ -71,7 +72,9 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
                     f"frame {index}: must be of the scene's {output.width}x{output.height} px (got {width}x{height})"
                 )
             is_film = following is not None and _leads_to(frame, following)
-            numbered = _numbered(frame, index, output, is_film=is_film)
+            poses = sha256(json.dumps(frame.layout.to_json()["instances"]).encode()).digest()
+            split = splits.setdefault(poses, split_of(len(splits), output))
+            numbered = _numbered(frame, index, split, is_film=is_film)
             with storage_errors(out):
                 write_text(out / layout_file(index), json.dumps(numbered.layout.to_json()))
                 record = write_frame(numbered, out, scene.spec, catalogue, original=frame)
@@ -85,14 +88,14 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
         return counts.summary(out, rendered=len(manifest))
 
 
-def _numbered(frame: Frame, index: int, output: Output, *, is_film: bool) -> Frame:
+def _numbered(frame: Frame, index: int, split: Split, *, is_film: bool) -> Frame:
     """Return a frame with the plan of the only view of layout ``index``."""
     plan = replace(
         frame.plan,
         index=index,
         layout=index,
         view=0,
-        split=split_of(index, output),
+        split=split,
         next_camera=frame.plan.next_camera if is_film else None,
         # The camera's pose and lens contain all drawn values except the motion.
         viewpoint={name: value for name, value in frame.plan.viewpoint.items() if name == "motion"},

@@ -64,6 +64,19 @@ def test_given_frames_have_no_violations_in_every_format(scene: Scene, frames: l
     assert poses[0][0][3] == pytest.approx(0.07)
 
 
+def test_frames_of_equal_poses_are_of_one_split(scene: Scene, frames: list, tmp_path: Path) -> None:
+    """Two cameras that see the same objects in the same places must not be in training and validation."""
+    aside = Camera.look_at((0.02, -0.05, 0.5), (0, 0, 0), width=64, height=48, fov_x=40)
+    layouts = [frame.layout for frame in frames]
+    beside = list(render_frames(scene, layouts=layouts, cameras=aside, quality="fast", progress=False))
+    rig = [frame for pair in zip(frames, beside, strict=True) for frame in pair]
+    summary = write_frames(scene, tmp_path / "out", rig)
+    splits = [record["split"] for record in records_of(tmp_path / "out")]
+    assert splits == [split_of(step, scene.spec.output) for step in (0, 0, 1, 1, 2, 2)]
+    assert summary.images == {"train": 4, "val": 2}
+    assert list(audit_dataset(tmp_path / "out").violations) == []
+
+
 def test_the_manifest_records_the_exposure_of_the_camera(scene: Scene, tmp_path: Path) -> None:
     motion = Motion(exposure=(0.01, 0.01))
     camera = scene.spec.camera.model_copy(update={"motion": motion})

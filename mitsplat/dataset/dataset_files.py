@@ -5,15 +5,17 @@ Other files in that folder are never removed. Folders of a dataset must not be l
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
 
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import TABLE
 from mitsplat.formats.yolo import TASKS
-from mitsplat.storage.files import SPLITS, read_json
+from mitsplat.storage.files import SPLITS, JsonObject, read_json
 
 CONTENT = "dataset.json"
 MANIFEST = "manifest.jsonl"
@@ -63,6 +65,11 @@ _WRITTEN = re.compile(
 def layout_file(index: int) -> str:
     """Return the name of the file of a layout, relative to the dataset."""
     return f"layouts/{index:04d}.json"
+
+
+def hash_poses(layout: JsonObject) -> bytes:
+    """Return the SHA-256 of the objects of a layout in JSON and of their poses, without the layout's number."""
+    return sha256(json.dumps(layout["instances"]).encode()).digest()
 
 
 def is_unfinished(name: str) -> bool:

@@ -6,9 +6,9 @@
     folds/fold1.yaml                                            for Ultralytics; other tasks have both in their folders
     folds/fold1_train.json, fold1_val.json                      COCO, if the dataset has it; names are below images/
 
-All views of a layout belong to the same fold, because they show the same objects in the same places. The test split is
-left out. Ultralytics resolves paths that begin with ``./`` from the folder of the list, so lists lie beside
-``images/``.
+All views of a layout belong to the same fold, because they show the same objects in the same places; so do frames of
+equal poses that were made in Python. The test split is left out. Ultralytics resolves paths that begin with ``./`` from
+the folder of the list, so lists lie beside ``images/``.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from mitsplat.dataset.dataset_files import remove_folds
+from mitsplat.dataset.dataset_files import hash_poses, layout_file, remove_folds
 from mitsplat.dataset.dataset_folder import open_finished
 from mitsplat.dataset.records.record_schema import read_content
 from mitsplat.errors import InputError
 from mitsplat.formats.coco import append_instances, create_instances_file, image_file
 from mitsplat.formats.yolo import TASKS, names_yaml
-from mitsplat.storage.files import GrowingFile, Record, storage_errors, write_text
+from mitsplat.storage.files import GrowingFile, Record, read_json, storage_errors, write_text
 from mitsplat.storage.json_stream import ListsFile
 
 
@@ -60,7 +60,8 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
     classes, keypoints = content["classes"], content["keypoints"]
     tasks = [task for task in TASKS if task in formats]
     with open_finished(root, content, write=True) as records, storage_errors(root), ExitStack() as cleanup:
-        layouts, images = _count(records)
+        first = _first_of_equal(root, records) if content.get("given", False) else {}
+        layouts, images = _count(records, first)
         if not 2 <= folds <= len(layouts):
             if len(layouts) < 2:
                 raise InputError(f"{root}: must have at least 2 layouts to be divided into folds (got {len(layouts)})")
@@ -84,7 +85,7 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
             cleanup.callback(file.discard)
         for record in records:
             for fold, name in enumerate(names) if record["split"] != "test" else ():
-                key = name, "val" if fold_of[record["layout"]] == fold else "train"
+                key = name, "val" if fold_of[_first(record, first)] == fold else "train"
                 for image_list in lists[key]:
                     image_list.write(f"./{image_file(record)}\n")
                 if coco_files:
@@ -104,14 +105,36 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
     ]
 
 
-def _count(records: Iterable[Record]) -> tuple[dict[int, Counter[str]], Counter[int]]:
-    """Return the number of instances by class, and the number of images, of each layout; the test split is left out."""
+def _first_of_equal(root: Path, records: Iterable[Record]) -> dict[int, int]:
+    """Return the first layout of equal poses for each layout of a dataset of frames made in Python."""
+    found, first = dict[bytes, int](), dict[int, int]()
+    for number in (record["layout"] for record in records):
+        path = root / layout_file(number)
+        try:
+            first[number] = found.setdefault(hash_poses(read_json(path)), number)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: must be the layout of a finished dataset ({error!r})") from error
+    return first
+
+
+def _first(record: Record, first: Mapping[int, int]) -> int:
+    """Return the first layout with the poses of a record's layout."""
+    layout: int = record["layout"]
+    return first.get(layout, layout)
+
+
+def _count(records: Iterable[Record], first: Mapping[int, int]) -> tuple[dict[int, Counter[str]], Counter[int]]:
+    """Return the number of instances by class, and the number of images, of each layout; the test split is left out.
+
+    A layout counts as the one that ``first`` names for it.
+    """
     layouts, images = dict[int, Counter[str]](), Counter[int]()
     for record in records:
         if record["split"] != "test":
             classes = (label["class"] for label in record["labels"]["instances"])
-            layouts.setdefault(record["layout"], Counter()).update(classes)
-            images[record["layout"]] += 1
+            layout = _first(record, first)
+            layouts.setdefault(layout, Counter()).update(classes)
+            images[layout] += 1
     return layouts, images
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 
 from mitsplat.arguments import check_type, path_of
-from mitsplat.dataset.dataset_files import TIMINGS, layout_file
+from mitsplat.dataset.dataset_files import TIMINGS, hash_poses, layout_file
 from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.records.manifest import append_line
 from mitsplat.dataset.write import DatasetSummary, FrameCounts
@@ -72,8 +71,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
                     f"frame {index}: must be of the scene's {output.width}x{output.height} px (got {width}x{height})"
                 )
             is_film = following is not None and _leads_to(frame, following)
-            poses = sha256(json.dumps(frame.layout.to_json()["instances"]).encode()).digest()
-            split = splits.setdefault(poses, split_of(len(splits), output))
+            split = splits.setdefault(hash_poses(frame.layout.to_json()), split_of(len(splits), output))
             numbered = _numbered(frame, index, split, is_film=is_film)
             with storage_errors(out):
                 write_text(out / layout_file(index), json.dumps(numbered.layout.to_json()))

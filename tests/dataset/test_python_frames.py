@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mitsplat.audit import audit_dataset
+from mitsplat.dataset.folds import write_folds
 from mitsplat.dataset.python_frames import write_frames
 from mitsplat.errors import InputError
 from mitsplat.frames.sequence import render_frames
@@ -74,7 +75,17 @@ def test_frames_of_equal_poses_are_of_one_split(scene: Scene, frames: list, tmp_
     splits = [record["split"] for record in records_of(tmp_path / "out")]
     assert splits == [split_of(step, scene.spec.output) for step in (0, 0, 1, 1, 2, 2)]
     assert summary.images == {"train": 4, "val": 2}
+    with pytest.raises(InputError, match=r"folds must be 2 to 3, the layouts of .* \(got 4\)"):
+        write_folds(tmp_path / "out", 4)
+    assert [fold.images for fold in write_folds(tmp_path / "out", 3)] == [2, 2, 2]
+    for fold in (1, 2, 3):
+        names = (tmp_path / f"out/fold{fold}_val.txt").read_text().split()
+        one, other = sorted(int(Path(name).stem) for name in names)
+        assert one % 2 == 0 and other == one + 1
     assert list(audit_dataset(tmp_path / "out").violations) == []
+    (tmp_path / "out/layouts/0002.json").write_text("{}")
+    with pytest.raises(InputError, match=r"layouts/0002\.json: must be the layout of a finished dataset \(KeyError"):
+        write_folds(tmp_path / "out", 3)
 
 
 def test_the_manifest_records_the_exposure_of_the_camera(scene: Scene, tmp_path: Path) -> None:

@@ -472,3 +472,14 @@ def test_the_number_of_video_frames_does_not_change_a_capture_of_photos(
     again = capture_photos(given, out, CaptureSettings(board=rendered.BOARD, frames=40))
     assert again.video is None
     assert [photo.name for photo in again.capture.photos] == [photo.name for photo in result.capture.photos]
+
+
+def test_too_few_different_photos_are_refused_with_the_reason(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path
+) -> None:
+    (tmp_path / "given").mkdir()
+    for number in range(4):
+        shutil.copyfile(captured[0] / "photo00.png", tmp_path / f"given/{number}.png")
+    reason = r"got 1; 1\.png: it is a copy of another photo; 2\.png: it is a copy of another photo; 3\.png: "
+    with pytest.raises(InputError, match=rf"needs at least 3 usable photographs \({reason}"):
+        capture_photos(tmp_path / "given", tmp_path / "out")

@@ -110,7 +110,8 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
         progress=progress,
     )
     if len(prepared) < MIN_PHOTOS:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(rejected.items())[:3])
+        unused = rejected | dict.fromkeys(copies, "it is a copy of another photo")
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(unused.items())[:3])
         raise InputError(f"{photos}: needs at least {MIN_PHOTOS} usable photographs (got {len(prepared)}; {reasons})")
     given = None
     if settings.poses is not None:

@@ -189,6 +189,7 @@ class _Actors(Generic[Result]):
             options["memory"] = amounts.pop("memory")
         self._actor = ray.remote(_Actor).options(**options, resources=amounts, max_restarts=0)
         self._kind = device.kind
+        self._threads = max(1, int(self._wanted["CPU"])) if "CPU" in self._wanted else None
         self._job = job
         self._stored = ray.put(job)
         self._answers: dict[Any, tuple[int, int, int]] = {}
@@ -222,7 +223,7 @@ class _Actors(Generic[Result]):
 
     def start(self) -> int:
         worker, self._count = self._count, self._count + 1
-        self._actors[worker] = self._actor.remote([self._stored], self._kind)
+        self._actors[worker] = self._actor.remote([self._stored], self._kind, self._threads)
         return worker
 
     def stop(self, worker: int) -> None:
@@ -264,10 +265,11 @@ class _Actors(Generic[Result]):
 class _Actor:
     """Worker on the cluster."""
 
-    def __init__(self, stored: list[Any], kind: Kind) -> None:
+    def __init__(self, stored: list[Any], kind: Kind, threads: int | None) -> None:
         import ray  # optional: the extra [cluster]
 
         self._kind: Kind | None = kind
+        self._threads = threads
         self._job = ray.get(stored[0])
 
     def settle(self, layout: int) -> Failure | str:
@@ -281,7 +283,7 @@ class _Actor:
             return layout
         try:
             if self._kind is not None:
-                use_shared_device(self._kind)
+                use_shared_device(self._kind, self._threads)
                 self._kind = None
             return Finished(self._job.make(frame, layout))
         except Exception as error:  # noqa: BLE001 - the caller raises it

@@ -334,7 +334,7 @@ class FakeRay:
     """Mock of the parts of Ray that describe machines."""
 
     def __init__(self, **nodes):
-        self.alive = nodes
+        self.alive, self.started = nodes, []
 
     def nodes(self):
         return [{"NodeID": name, "Alive": cpus > 0, "Resources": {"CPU": cpus}} for name, cpus in self.alive.items()]
@@ -346,7 +346,22 @@ class FakeRay:
         return value
 
     def remote(self, kind):
-        return SimpleNamespace(options=lambda **options: SimpleNamespace(remote=lambda *arguments: object()))
+        start = SimpleNamespace(remote=lambda *arguments: self.started.append(arguments) or object())
+        return SimpleNamespace(options=lambda **options: start)
+
+
+@pytest.mark.parametrize(("resources", "threads"), [({"CPU": 4.0}, 4), ({"CPU": 0.5}, 1), ({"node": 1.0}, None)])
+def test_a_ray_worker_has_a_thread_for_each_reserved_cpu(monkeypatch, resources, threads):
+    ray = FakeRay(head=8.0)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(ray, "nodes", lambda: [{"NodeID": "a", "Alive": True, "Resources": {"CPU": 8.0, "node": 1.0}}])
+    cluster._Actors(None, Cluster(resources=resources), 1).start()
+    assert [arguments[1:] for arguments in ray.started] == [("cpu", threads)]
+    used = []
+    monkeypatch.setattr(cluster, "use_shared_device", lambda *device: used.append(device))
+    monkeypatch.setattr(ray, "get", lambda job: SimpleNamespace(make=lambda frame, layout: frame), raising=False)
+    assert cluster._Actor(["job"], "cpu", threads).make(3, "layout").result == 3
+    assert used == [("cpu", threads)]
 
 
 def test_machines_that_join_are_reported_once(monkeypatch):

@@ -125,7 +125,7 @@ class Solids:
         params["faces"] = wrapped(mi.UInt32, triangles.astype(np.uint32))
         params.update()
         return cls(
-            ray_scene({"mesh": mesh}),
+            ray_scene({"mesh": mesh}, watertight=False),  # sooner; solids stop rays at random anyway
             mi.Point3f(*[dr.opaque(mi.Float, float(v)) for v in middle]),
             dr.opaque(mi.Float, float(radius)),
             sets,

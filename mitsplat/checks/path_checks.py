@@ -45,8 +45,8 @@ MAX_FAULTY = 0.01
 MIN_OPACITY = 1 / 255
 MIN_OVERLAP = 0.5
 MAX_OFFSET = 0.02
-MIN_KEYPOINT_SPREAD = 0.01
-"""Minimum distance between the first and the farthest keypoint, as a fraction of the longest extent."""
+MAX_KEYPOINT_DISTANCE = 10.0
+"""Maximum distance of keypoints from the object, in longest extents; the poses of a gripper can lie beside it."""
 MAX_SPREAD = 0.05
 """Maximum median distance between splats and mesh, as a fraction of the mesh's diagonal."""
 MIN_SPREAD_DIFFERENCE = 0.5
@@ -203,25 +203,28 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
 
 
 def _keypoints(asset: Asset, core: Float64Array) -> Finding:
-    """Find named points that seem to be in another unit: far from the object, or all at one place."""
-    points = asset.keypoint_array
+    """Find named points that seem to be in another unit: far from the object, or on it only if they are in metres."""
+    points, names = asset.keypoint_array, list(asset.keypoints)
     low, high = (core.min(axis=0), core.max(axis=0)) if asset.mesh is None else asset.mesh.bounds
     size = float((high - low).max())
-    outside = np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=1)
-    spread = float(np.linalg.norm(points - points[0], axis=1).max())
+
+    def outside(points: Float64Array) -> Float64Array:
+        distances: Float64Array = np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=1)
+        return distances
+
+    distances = outside(points)
+    is_far = bool(distances.max() > MAX_KEYPOINT_DISTANCE * size)
+    # One point at the origin is a common choice.
+    is_small = len(points) > 1 and bool(outside(1000 * points).max() <= size)
     text = f"{len(points)} named points on the object or near it"
-    is_far, is_one = outside.max() > size, len(points) > 1 and spread < MIN_KEYPOINT_SPREAD * size
-    names = list(asset.keypoints)
     if is_far:
-        text = (
-            f"{names[int(np.argmax(outside))]} lies {outside.max():.3g} m from the object, which measures {size:.3g} m"
-        )
-    elif is_one:
-        text = (
-            f"all {len(points)} lie within {1000 * spread:.3g} mm of {names[0]}, but the object measures {size:.3g} m"
-        )
+        farthest = int(np.argmax(distances))
+        text = f"{names[farthest]} lies {distances[farthest]:.3g} m from the object, which measures {size:.3g} m"
+    elif is_small:
+        reach = 1000 * float(np.linalg.norm(points, axis=1).max())
+        text = f"all {len(points)} lie within {reach:.3g} mm of the origin, but the object measures {size:.3g} m"
     remedy = "give keypoints in the units of the asset's files, see units in asset.yaml"
-    return Finding("keypoints", not (is_far or is_one), text, remedy)
+    return Finding("keypoints", not (is_far or is_small), text, remedy)
 
 
 def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:

@@ -52,6 +52,11 @@ def test_named_points_on_in_and_near_an_object_are_no_problem():
     points = {"tip": (0, 0, 0.025), "grip": (0, 0, 0), "hand": (0, 0, 0.07)}
     assert wrong(check_asset(replace(solid(), keypoints=points))) == {}
     assert wrong(check_asset(replace(solid(), keypoints={"middle": (0, 0, 0)}))) == {}
+    approach = {"grip": (0, 0, 0.02), "before": (0, 0, 0.4)}
+    assert wrong(check_asset(replace(solid(), keypoints=approach))) == {}
+    for shift in (0.0, 0.025):  # pins of a plug, at the origin of its files or not
+        pins = {"left": (shift, -0.0002, 0), "right": (shift, 0.0002, 0)}
+        assert wrong(check_asset(replace(solid(), keypoints=pins))) == {}
 
 
 def test_named_points_in_another_unit_are_named_with_the_line_to_change(tmp_path):
@@ -62,7 +67,7 @@ def test_named_points_in_another_unit_are_named_with_the_line_to_change(tmp_path
     assert wrong(check_path(tmp_path / "box")) == {}
     described.write_text(re.sub(r"\b(10|20)\.0", lambda found: str(float(found[0]) / 1000), described.read_text()))
     (problem,) = wrong(check_path(tmp_path / "box")).values()
-    assert problem.text == "all 2 lie within 0.0224 mm of tip, but the object measures 0.06 m"
+    assert problem.text == "all 2 lie within 0.02 mm of the origin, but the object measures 0.06 m"
     assert re.fullmatch(r".*asset\.yaml:\d+: keypoints", str(problem.place))
 
 

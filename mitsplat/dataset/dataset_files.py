@@ -68,8 +68,11 @@ def layout_file(index: int) -> str:
 
 
 def hash_poses(layout: JsonObject) -> bytes:
-    """Return the SHA-256 of the objects of a layout in JSON and of their poses, without the layout's number."""
-    return sha256(json.dumps(layout["instances"]).encode()).digest()
+    """Return the SHA-256 of the objects of a layout in JSON and of their poses; of its number if it has no objects.
+
+    Layouts without objects have no poses that training and validation could have in common.
+    """
+    return sha256(json.dumps(layout["instances"] or layout["index"]).encode()).digest()
 
 
 def is_unfinished(name: str) -> bool:

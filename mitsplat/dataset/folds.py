@@ -63,9 +63,10 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
         first = _first_of_equal(root, records) if content.get("given", False) else {}
         layouts, images = _count(records, first)
         if not 2 <= folds <= len(layouts):
+            parts = "layouts of different poses" if first else "layouts"
             if len(layouts) < 2:
-                raise InputError(f"{root}: must have at least 2 layouts to be divided into folds (got {len(layouts)})")
-            raise InputError(f"folds must be 2 to {len(layouts)}, the layouts of {root} (got {folds})")
+                raise InputError(f"{root}: must have at least 2 {parts} to be divided into folds (got {len(layouts)})")
+            raise InputError(f"folds must be 2 to {len(layouts)}, the {parts} of {root} (got {folds})")
         fold_of = assign_folds(layouts, folds)
         remove_folds(root)
         names = [f"fold{fold + 1}" for fold in range(folds)]

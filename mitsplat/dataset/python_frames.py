@@ -30,10 +30,10 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
         ms.write_frames(scene, "out/film", ms.render_frames(scene, layouts=simulate(), cameras=camera))
 
     Frames are numbered in the order of the iterable. Each frame counts as a layout of its own. Frames of equal poses,
-    such as those of several cameras, are of one split, which the number of different poses before them determines. The
-    audit compares pictures, labels, layouts and cameras of such a dataset with each other, but not cameras with the
-    scene. An interrupted run cannot be resumed. A frame has a file of its flow if this leads to the next frame of the
-    iterable, as in a film of :func:`mitsplat.render_frames`.
+    such as those of several cameras or of a moving camera, are of one split, which the number of different poses before
+    them determines. Frames without objects count as different. The audit compares pictures, labels, layouts and cameras
+    of such a dataset with each other, but not cameras with the scene. An interrupted run cannot be resumed. A frame has
+    a file of its flow if this leads to the next frame of the iterable, as in a film of :func:`mitsplat.render_frames`.
 
     Args:
         scene: Scene of all frames; image size and formats are in ``scene.spec``.
@@ -71,10 +71,11 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
                     f"frame {index}: must be of the scene's {output.width}x{output.height} px (got {width}x{height})"
                 )
             is_film = following is not None and _leads_to(frame, following)
-            split = splits.setdefault(hash_poses(frame.layout.to_json()), split_of(len(splits), output))
+            layout = replace(frame.layout, index=index).to_json()
+            split = splits.setdefault(hash_poses(layout), split_of(len(splits), output))
             numbered = _numbered(frame, index, split, is_film=is_film)
             with storage_errors(out):
-                write_text(out / layout_file(index), json.dumps(numbered.layout.to_json()))
+                write_text(out / layout_file(index), json.dumps(layout))
                 record = write_frame(numbered, out, scene.spec, catalogue, original=frame)
                 if is_film:
                     record["next"] = index + 1

@@ -75,7 +75,7 @@ def test_frames_of_equal_poses_are_of_one_split(scene: Scene, frames: list, tmp_
     splits = [record["split"] for record in records_of(tmp_path / "out")]
     assert splits == [split_of(step, scene.spec.output) for step in (0, 0, 1, 1, 2, 2)]
     assert summary.images == {"train": 4, "val": 2}
-    with pytest.raises(InputError, match=r"folds must be 2 to 3, the layouts of .* \(got 4\)"):
+    with pytest.raises(InputError, match=r"folds must be 2 to 3, the layouts of different poses of .* \(got 4\)"):
         write_folds(tmp_path / "out", 4)
     assert [fold.images for fold in write_folds(tmp_path / "out", 3)] == [2, 2, 2]
     for fold in (1, 2, 3):
@@ -86,6 +86,23 @@ def test_frames_of_equal_poses_are_of_one_split(scene: Scene, frames: list, tmp_
     (tmp_path / "out/layouts/0002.json").write_text("{}")
     with pytest.raises(InputError, match=r"layouts/0002\.json: must be the layout of a finished dataset \(KeyError"):
         write_folds(tmp_path / "out", 3)
+
+
+def test_frames_without_objects_are_spread_over_splits_and_folds(scene: Scene, frames: list, tmp_path: Path) -> None:
+    """Their poses are equal because there are none; one split with all of them would leave the others without any."""
+    empty = Layout.from_poses(scene, {})
+    background = next(render_frames(scene, layouts=empty, quality="fast", progress=False))
+    write_frames(scene, tmp_path / "out", [*[background] * 4, frames[0], frames[0]])
+    splits = [record["split"] for record in records_of(tmp_path / "out")]
+    assert splits == [split_of(layout, scene.spec.output) for layout in (0, 1, 2, 3, 4, 4)]
+    assert sorted(fold.images for fold in write_folds(tmp_path / "out", 5)) == [1, 1, 1, 1, 2]
+
+
+def test_folds_of_frames_of_one_arrangement_are_refused(scene: Scene, frames: list, tmp_path: Path) -> None:
+    write_frames(scene, tmp_path / "out", [frames[0]] * 3)
+    reason = r"must have at least 2 layouts of different poses to be divided into folds \(got 1\)"
+    with pytest.raises(InputError, match=reason):
+        write_folds(tmp_path / "out", 2)
 
 
 def test_the_manifest_records_the_exposure_of_the_camera(scene: Scene, tmp_path: Path) -> None:

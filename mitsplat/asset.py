@@ -29,7 +29,7 @@ from ruamel.yaml import YAML
 from scipy.spatial import QhullError
 
 from mitsplat.arguments import checks_arguments, path_of
-from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.arrays import Float32Array, Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
@@ -402,16 +402,28 @@ def _hull(points: npt.NDArray[np.floating], place: str) -> trimesh.Trimesh:
 
 
 def _read_pieces(path: Path) -> tuple[trimesh.Trimesh, ...]:
-    """Read a mesh file and return the convex hulls of its connected parts.
-
-    Faces with a common vertex are of one part. Hulls by Qhull can have faces without neighbours, which a search along
-    edges would take for parts.
-    """
+    """Read a mesh file and return the convex hulls of its parts."""
     mesh = read_mesh(path, merge=False)
-    labels = trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))
-    numbers = labels[mesh.faces[:, 0]]
+    numbers = _part_numbers(mesh)
     parts = [mesh.vertices[np.unique(mesh.faces[numbers == number])] for number in dict.fromkeys(numbers.tolist())]
     return tuple(_hull(part, str(path)) for part in parts)
+
+
+def _part_numbers(mesh: trimesh.Trimesh) -> Int64Array:
+    """Return the number of the part of each face, shape (F,).
+
+    Closed surfaces are parts, even if they have vertices in common. Other faces are of the part with which they have a
+    vertex in common: hulls by Qhull can have faces without neighbours.
+    """
+    surfaces = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    edges, uses = np.unique(np.column_stack([surfaces[mesh.edges_face], mesh.edges_sorted]), axis=0, return_counts=True)
+    is_open = np.zeros(surfaces.max() + 1, dtype=bool)
+    is_open[edges[uses != 2, 0]] = True
+    is_joint = np.zeros(len(mesh.vertices), dtype=bool)
+    is_joint[mesh.faces[is_open[surfaces]]] = True
+    joints = np.column_stack([np.repeat(surfaces, 3), len(is_open) + mesh.faces.ravel()])[is_joint[mesh.faces.ravel()]]
+    parts = trimesh.graph.connected_component_labels(joints, node_count=len(is_open) + len(mesh.vertices))
+    return np.asarray(parts[surfaces], dtype=np.int64)
 
 
 def _concatenated(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:

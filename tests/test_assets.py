@@ -135,6 +135,24 @@ class TestRoundTrip:
         assert [round(piece.volume, 9) for piece in found] == [round(piece.volume, 9) for piece in (other, one)]
         assert all(piece.is_watertight for piece in found)
 
+    @pytest.mark.parametrize("stray", [False, True])
+    @pytest.mark.parametrize("common", [1, 2])
+    def test_closed_pieces_with_common_vertices_stay_apart(self, asset, tmp_path, common, stray):
+        """Programs that merge equal vertices weld pieces that touch. One hull of both would fill the space between."""
+        ball = trimesh.creation.icosphere(1, radius=0.01)
+        middle = ball.vertices[ball.edges[0, :common]].mean(axis=0)
+        both = trimesh.util.concatenate([ball, ball.copy().apply_translation(2 * middle)])
+        both.merge_vertices()
+        assert len(both.vertices) == 2 * len(ball.vertices) - common
+        if stray:  # a face that shares no edge with others
+            corners = [ball.vertices[np.argmin(ball.vertices @ axis)] for axis in np.eye(3) * np.sign(middle + 1e-9)]
+            face = [int(np.argmin(np.linalg.norm(both.vertices - corner, axis=1))) for corner in corners]
+            both = trimesh.Trimesh(both.vertices, [*both.faces, face], process=False)
+        replace(asset, pieces=(ball,)).save(tmp_path)
+        both.export(tmp_path / "pieces.ply")
+        pieces = Asset.load(tmp_path).pieces
+        assert [piece.volume for piece in pieces] == pytest.approx([ball.volume, ball.volume], rel=1e-4)
+
     def test_assets_that_could_not_be_read_are_not_saved(self, asset, tmp_path):
         for change, sentence in [
             ({"mesh": None, "pieces": ()}, "an object needs a mesh"),

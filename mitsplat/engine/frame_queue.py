@@ -63,13 +63,9 @@ class FrameQueue:
         self.waiting[layout].appendleft(frame)
         self.left += 1
         heappush(self._longest, (-len(self.waiting[layout]), self._order[layout], layout))
-        self.leave(worker)
-
-    def leave(self, worker: int) -> None:
-        """Remove a worker that has gone."""
-        layout = self._layouts.pop(worker)
+        del self._layouts[worker]
         self._workers[layout] -= 1
-        if layout in self.waiting and not self._workers[layout]:
+        if not self._workers[layout]:
             heappush(self._free, (self._order[layout], layout))
 
     def _first_free(self) -> int | None:

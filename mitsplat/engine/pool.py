@@ -90,7 +90,7 @@ def run_frames(
     """
     check_workers(workers)
     total = sum(map(len, layouts.values()))
-    max_workers = affordable_workers(memory, device) if workers is None else workers
+    max_workers = min(affordable_workers(memory, device) if workers is None else workers, max(1, total))
     later = list(layouts)[max_workers:]  # the workers begin with the others
     worthwhile = prepare is not None and total > _MAX_SERIAL_FRAMES and workers != 1
     helpers = min(len(later), _affordable_helpers(max_workers, memory)) if worthwhile else 0
@@ -100,7 +100,7 @@ def run_frames(
         return
     if serial:
         max_workers = 1
-    shares = device is not None and 0 < len(device.gpus) < min(max_workers, total)
+    shares = device is not None and 0 < len(device.gpus) < max_workers
     with closing(SharedGpu()) if shares else nullcontext() as shared:
         if shared is not None and shared.problem:
             note(f"workers take turns on the GPU, because {shared.problem}")

@@ -147,6 +147,15 @@ def test_automatic_workers_start_at_once_and_share_the_cores(monkeypatch, cores,
     assert began == [(workers, threads)]
 
 
+def test_workers_without_a_frame_take_no_share_of_the_cores(monkeypatch):
+    """Eight cores run two frames in two processes of four threads, also if there may be eight processes."""
+    monkeypatch.setattr(engine, "usable_cores", lambda: 8)
+    began = []
+    monkeypatch.setattr(engine, "run_pool", lambda *args: began.append((args[2], args[0]._threads)) or (i for i in ()))
+    list(run_frames(Variant(), {0: [3], 1: [5]}, workers=8, note=print, device=CPU))
+    assert began == [(2, 4)]
+
+
 @pytest.fixture
 def interpreter(tmp_path, monkeypatch):
     """Replace Python by a shell script in worker processes."""
@@ -493,19 +502,16 @@ class SlowPlan:
 
     def put_back(self, worker, frame):
         self.waiting.setdefault(self.layouts[worker], []).insert(0, frame)
-        self.leave(worker)
-
-    def leave(self, worker):
         del self.layouts[worker]
 
 
 @settings(max_examples=300, deadline=None)
 @given(
     sizes=st.lists(st.integers(0, 6), max_size=9),
-    events=st.lists(st.tuples(st.integers(0, 4), st.sampled_from(["take"] * 6 + ["lost", "dismissed"])), max_size=80),
+    events=st.lists(st.tuples(st.integers(0, 4), st.sampled_from(["take"] * 6 + ["lost"])), max_size=80),
 )
 def test_the_plan_agrees_with_its_slow_twin(sizes, events):
-    """Workers take frames, are lost with their frame, and are stopped, in any order."""
+    """Workers take frames and are lost with their frame, in any order."""
     layouts = {7 * number: [100 * number + view for view in range(size)] for number, size in enumerate(sizes)}
     fast, slow = FrameQueue(layouts), SlowPlan(layouts)
     at_work = {}
@@ -515,9 +521,9 @@ def test_the_plan_agrees_with_its_slow_twin(sizes, events):
             assert fast.take(worker) == task
             at_work[worker] = task
         elif at_work.get(worker) is not None:
-            for plan in (fast, slow):
-                plan.put_back(worker, at_work[worker][1]) if event == "lost" else plan.leave(worker)
-            del at_work[worker]
+            _, frame = at_work.pop(worker)
+            fast.put_back(worker, frame)
+            slow.put_back(worker, frame)
         assert fast.left == sum(map(len, slow.waiting.values()))
     rest = [(fast.take(9), slow.take(9)) for _ in range(fast.left + 1)]
     assert all(one == other for one, other in rest) and rest[-1] == (None, None)

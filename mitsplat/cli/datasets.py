@@ -332,8 +332,8 @@ def split(
 ) -> None:
     """Write image lists of DATASET for cross-validation.
 
-    All images of a layout are in the same fold. Classes are spread evenly over the folds as far as whole layouts allow.
-    The test split is not used.
+    All images of a layout are in the same fold, and so are frames of equal poses that were made in Python. Classes are
+    spread evenly over the folds as far as whole layouts allow. The test split is not used.
     """
     from mitsplat.dataset.folds import write_folds
 

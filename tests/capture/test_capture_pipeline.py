@@ -483,3 +483,21 @@ def test_too_few_different_photos_are_refused_with_the_reason(
     reason = r"got 1; 1\.png: it is a copy of another photo; 2\.png: it is a copy of another photo; 3\.png: "
     with pytest.raises(InputError, match=rf"needs at least 3 usable photographs \({reason}"):
         capture_photos(tmp_path / "given", tmp_path / "out")
+
+
+def test_empty_files_are_unreadable_and_no_copies_of_each_other(
+    captured: tuple[Path, Path, CaptureResult], tmp_path: Path
+) -> None:
+    """An interrupted transfer leaves several of them; they count as photos that could not be used."""
+    (tmp_path / "given").mkdir()
+    shutil.copyfile(captured[0] / "photo00.png", tmp_path / "given/0.png")
+    for number in (1, 2):
+        (tmp_path / f"given/{number}.png").touch()
+    with pytest.raises(InputError, match=r"got 1; 1\.png: it cannot be read \(.*\); 2\.png: it cannot be read \("):
+        capture_photos(tmp_path / "given", tmp_path / "out")
+
+
+def test_the_copy_that_a_setting_names_is_kept() -> None:
+    hashes = {"a.png": "1", "a (1).png": "1", "b.png": "2", "b (1).png": "2", "c.png": "3", "c (1).png": "3"}
+    settings = CaptureSettings(picks=("a (1).png:9,8",), scale_from=("b.png", "c (1).png:5,5", 0.1))
+    assert take._find_copies(hashes, settings.named_photos) == ["a.png", "b (1).png", "c.png"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -98,7 +98,9 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
     _delete_outdated(out, inputs, settings)
     names = [path.relative_to(photos).as_posix() for path in files]
     unnamed = [] if settings.poses is None else unnamed_photos(settings.poses, names, photos)
-    copies = _find_copies(inputs["photos"]) if settings.poses is None else []
+    # Empty files are equal, but are no photos.
+    hashes = {name: inputs["photos"][name] for name, path in zip(names, files, strict=True) if path.stat().st_size}
+    copies = _find_copies(hashes, settings.named_photos) if settings.poses is None else []
     prepared, rejected = prepare_photos(
         photos,
         out / "images",
@@ -199,13 +201,17 @@ def _check_outputs(out: Path, photos: Path, settings: CaptureSettings) -> None:
             raise InputError(f"{folder}: already exists and is not part of a capture: choose another folder")
 
 
-def _find_copies(hashes: Mapping[str, str]) -> list[str]:
-    """Return the names of files whose content is that of a file with a shorter name; the mapping has hashes by name.
+def _find_copies(hashes: Mapping[str, str], named: Collection[str]) -> list[str]:
+    """Return the names of files that are copies of others.
 
     A copy of a training photo among the held-out photos would make the result look better than it is.
+
+    Args:
+        hashes: Hashes of the contents by name.
+        named: Names that settings mention. One of them is kept if there are copies, else the shortest name.
     """
     first: dict[str, str] = {}
-    for name in sorted(hashes, key=len):
+    for name in sorted(hashes, key=lambda name: (name not in named, len(name))):
         first.setdefault(hashes[name], name)
     return [name for name, content in hashes.items() if first[content] != name]
 

@@ -54,6 +54,12 @@ class CaptureSettings:
         """True if picks or a box indicate the object."""
         return bool(self.picks or self.picks_not or self.box)
 
+    @property
+    def named_photos(self) -> frozenset[str]:
+        """Names of the photos in which picks or the points of a distance lie."""
+        spots = [*self.picks, *self.picks_not, *(self.scale_from or ())[:2]]
+        return frozenset(spot.rpartition(":")[0] or spot for spot in map(str, spots))
+
     def __post_init__(self) -> None:
         check_fields(self)
         rules = (

@@ -417,7 +417,10 @@ def test_photos_of_another_scene_are_rejected(
     ("options", "sentence"),
     [
         (["--squares", "7"], "--squares must be COLUMNSxROWS, such as 7x5 (got 7)"),
-        (["--tag", "0"], "the edge of tags must be > 0 m (got 0.0)"),
+        (["--tag", "0"], "the edge of tags must be 0.001 to 10 m (got 0.0)"),
+        (["--tag", "inf"], "the edge of tags must be 0.001 to 10 m (got inf)"),
+        (["--scale-from", "a.jpg", "b.jpg", "nan"], "the distance of a.jpg and b.jpg must be 1e-6 to 1e6 m (got nan)"),
+        (["--scale-from", "a.jpg", "b.jpg", "0"], "the distance of a.jpg and b.jpg must be 1e-6 to 1e6 m (got 0)"),
         (["--metric"], "--metric requires --poses"),
         (["--max-size", "10"], "the size of photos must be at least 64 px (got 10)"),
         (["--masks", "a", "--mask-model", "b"], "--masks and --mask-model both define the masks: give only one"),

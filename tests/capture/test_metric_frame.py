@@ -252,8 +252,8 @@ def test_a_distance_determines_scale_and_the_table_the_vertical(blank: dict[str,
         (("gone.png", "04.png", 1.0), "gone.png: must name a photo with a camera, such as "),
         (("00.png:1", "04.png", 1.0), "00.png:1: a pixel must be given as X,Y (got 1)"),
         (("00.png:0,0", "04.png", 1.0), "00.png:0,0: the photo observes no point within 19 px of this pixel"),
-        (("00.png", "04.png", -1.0), "the distance of 00.png and 04.png must be 1e-6 to 1e6 m (got -1.0"),
-        (("00.png", "00.png", 1.0), "the distance of 00.png and 00.png must be 1e-6 to 1e6 m"),
+        (("00.png", "04.png", -1.0), "the distance of 00.png and 04.png must be 1e-6 to 1e6 m (got -1)"),
+        (("00.png", "00.png", 1.0), "00.png and 00.png must be different points of the model"),
     ],
 )
 def test_an_invalid_distance_is_refused_in_one_sentence(

@@ -130,15 +130,25 @@ def _distance_evidence(model: SparseModel, scale_from: tuple[str, str, float]) -
     """Return the scale by two points and their distance [m].
 
     Raises:
-        InputError: If a point does not exist, or if the distance is 0 or out of range.
+        InputError: If a point does not exist, the points coincide, or the distance is out of range.
     """
+    check_distance(scale_from)
     one, other, metres = scale_from
     gap = float(np.linalg.norm(spot(model, one) - spot(model, other)))
-    if not (1e-6 <= metres <= 1e6 and gap > 0):
-        raise InputError(
-            f"the distance of {one} and {other} must be 1e-6 to 1e6 m (got {metres}, {gap:.3g} in the model)"
-        )
+    if not gap > 0:
+        raise InputError(f"{one} and {other} must be different points of the model, to state their distance")
     return FrameEvidence(scale=metres / gap, source=f"the distance of {one} and {other}")
+
+
+def check_distance(scale_from: tuple[str, str, float]) -> None:
+    """Check the stated distance [m] of two points.
+
+    Raises:
+        InputError: If it is out of range.
+    """
+    one, other, metres = scale_from
+    if not 1e-6 <= metres <= 1e6:
+        raise InputError(f"the distance of {one} and {other} must be 1e-6 to 1e6 m (got {metres:g})")
 
 
 def spot(model: SparseModel, name: str) -> Float64Array:

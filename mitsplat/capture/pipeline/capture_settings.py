@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from mitsplat.arguments import check_fields
-from mitsplat.capture.alignment.metric_frame import DEFAULT_BOARD
-from mitsplat.capture.boards.targets import Board
+from mitsplat.capture.alignment.metric_frame import DEFAULT_BOARD, check_distance
+from mitsplat.capture.boards.targets import LEAST_SQUARE, Board
 from mitsplat.errors import InputError
 
 
@@ -64,7 +64,10 @@ class CaptureSettings:
         check_fields(self)
         rules = (
             (self.max_size < 64, f"the size of photos must be at least 64 px (got {self.max_size})"),
-            (self.tag is not None and not self.tag > 0, f"the edge of tags must be > 0 m (got {self.tag})"),
+            (
+                self.tag is not None and not LEAST_SQUARE <= self.tag <= 10,
+                f"the edge of tags must be {LEAST_SQUARE} to 10 m (got {self.tag})",
+            ),
             (self.metric and self.poses is None, "--metric requires --poses"),
             (
                 self.masks is not None and self.mask_model is not None,
@@ -83,3 +86,5 @@ class CaptureSettings:
         for broken, rule in rules:
             if broken:
                 raise InputError(rule)
+        if self.scale_from is not None:
+            check_distance(self.scale_from)

@@ -65,6 +65,10 @@ class BallView:
             raise InputError(f"--ball must have a radius > 0 (got {self.ball})")
 
 
+_LARGEST = 1e6
+"""Largest distance [m] and irradiance [W/m^2], so that radiance does not exceed the numbers of an image file."""
+
+
 @dataclass(frozen=True)
 class LightSettings:
     """Settings of the conversion of light to lines of a scene file.
@@ -87,8 +91,8 @@ class LightSettings:
 
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("irradiance", self.irradiance)):
-            if value is not None and not 0 < value < np.inf:
-                raise InputError(f"--{name} must be finite and > 0 (got {value:g})")
+            if value is not None and not 0 < value <= _LARGEST:
+                raise InputError(f"--{name} must be > 0 and at most {_LARGEST:g} (got {value:g})")
         if self.lamps < 0:
             raise InputError(f"--lamps must be >= 0 (got {self.lamps})")
         if not np.isfinite([*self.around, self.rotate_z]).all():

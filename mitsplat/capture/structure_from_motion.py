@@ -14,7 +14,7 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -127,7 +127,25 @@ def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | 
         InputError: If no two photos share enough points to start with.
         MissingResourceError: If COLMAP aborts its process.
     """
-    return _read_arrays(_run({"task": "reconstruct", **_job(photos, folder)}, folder, progress), photos)
+    model = _reconstruct(photos, lens_groups(photos), folder, progress)
+    shared = lens_groups(photos, by_folder=False)
+    # Folders of few photos can be of one camera, whose intrinsics need all of them.
+    if len(model.cameras) < ENOUGH * len(photos) and len(shared) < len(lens_groups(photos)):
+        with suppress(InputError):
+            model = max(model, _reconstruct(photos, shared, folder / "shared", progress), key=_count_sure)
+    return model
+
+
+def _reconstruct(
+    photos: Sequence[Prepared], groups: Sequence[Sequence[Prepared]], folder: Path, progress: Progress | None
+) -> SparseModel:
+    """Find the cameras of photos that share intrinsics in groups."""
+    return _read_arrays(_run({"task": "reconstruct", **_job(photos, groups, folder)}, folder, progress), photos)
+
+
+def _count_sure(model: SparseModel) -> int:
+    """Return the number of cameras that agree with most of their matches."""
+    return sum(share >= SURE_AGREEMENT for share in model.agreement.values())
 
 
 def find_points(
@@ -151,7 +169,7 @@ def find_points(
         }
         for name, camera in cameras.items()
     }
-    job = _job(photos, folder) | {"groups": [[photo.file.name] for photo in photos], "camera_model": "FULL_OPENCV"}
+    job = _job(photos, [[photo] for photo in photos], folder) | {"camera_model": "FULL_OPENCV"}
     model = _read_arrays(_run({"task": "triangulate", "cameras": known, **job}, folder, progress), photos)
     seen = {name: model.seen.get(name, np.zeros(0, dtype=np.int32)) for name in cameras}
     return SparseModel(cameras, model.points, model.colours, seen, reprojection_error=model.reprojection_error)
@@ -213,22 +231,22 @@ def opencv_camera(
         raise InputError(f"a camera of lens model {model} cannot be used: {error}") from error
 
 
-def lens_groups(photos: Sequence[Prepared]) -> list[list[Prepared]]:
+def lens_groups(photos: Sequence[Prepared], *, by_folder: bool = True) -> list[list[Prepared]]:
     """Group the photos that share intrinsics: those of one size and equal EXIF data.
 
-    Without EXIF data, they are also of one folder, because another folder is often that of another camera or zoom
-    setting. Folders of fewer than :data:`MIN_FOLDER` photos form one group.
+    Without EXIF data, and with ``by_folder``, they are also of one folder, because another folder is often that of
+    another camera or zoom setting. Folders of fewer than :data:`MIN_FOLDER` photos form one group.
     """
     folders = [Path(photo.name).parent for photo in photos]
     sizes = Counter((photo.lens, folder) for photo, folder in zip(photos, folders, strict=True))
     groups: dict[tuple[tuple[str, ...], Path | None], list[Prepared]] = {}
     for photo, folder in zip(photos, folders, strict=True):
-        is_apart = len(photo.lens) == 2 and sizes[photo.lens, folder] >= MIN_FOLDER
+        is_apart = by_folder and len(photo.lens) == 2 and sizes[photo.lens, folder] >= MIN_FOLDER
         groups.setdefault((photo.lens, folder if is_apart else None), []).append(photo)
     return list(groups.values())
 
 
-def _job(photos: Sequence[Prepared], folder: Path) -> JsonObject:
+def _job(photos: Sequence[Prepared], groups: Sequence[Sequence[Prepared]], folder: Path) -> JsonObject:
     """Return the job for the photos: finer features for few photos, sequential matching for many.
 
     The job has the photo folder relative to its own folder, so that results stay valid when both are moved together.
@@ -236,7 +254,7 @@ def _job(photos: Sequence[Prepared], folder: Path) -> JsonObject:
     few, many = len(photos) <= 100, len(photos) > 150
     return {
         "images": os.path.relpath(photos[0].file.parent, folder),
-        "groups": [[photo.file.name for photo in group] for group in lens_groups(photos)],
+        "groups": [[photo.file.name for photo in group] for group in groups],
         "features": 8192 if few else 4096,
         "first_octave": -1 if few else 0,
         "matching": "sequential" if many else "exhaustive",

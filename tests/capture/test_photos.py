@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,9 +11,10 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
+from mitsplat.capture import structure_from_motion
 from mitsplat.capture.capture import Photo
 from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
-from mitsplat.capture.structure_from_motion import lens_groups
+from mitsplat.capture.structure_from_motion import SparseModel, lens_groups
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
 
@@ -185,3 +187,39 @@ def test_photos_without_exif_data_share_intrinsics_only_within_their_folder(tmp_
     together = sorted(sorted({Path(photo.name).parent.as_posix() for photo in group}) for group in groups)
     assert together == [["phone", "phone/ring 2"], ["rig/1", "rig/2"], ["tele"], ["wide"]]
     assert sum(map(len, groups)) == sum(folders.values())
+
+
+@pytest.mark.parametrize(
+    ("apart", "shared", "kept"),
+    [
+        ([1.0] * 5, None, 0),  # enough photos have cameras
+        ([1.0] * 4, [1.0] * 5, 1),
+        ([1.0] * 4, [1.0] * 4, 0),
+        ([1.0] * 4, [1.0] * 3 + [0.01] * 3, 0),  # cameras that are wrong do not count
+        ([1.0] * 4, [], 0),
+    ],
+)
+def test_folders_of_one_camera_share_intrinsics_if_few_photos_have_cameras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, apart: list[float], shared: list[float] | None, kept: int
+) -> None:
+    """Of 23 photos without EXIF data, 17 had cameras with intrinsics for each three, and 20 with common ones."""
+    photos = [Prepared(f"{n // 3}/{n}.png", tmp_path / f"{n}.png", (8, 6), 1, ("8", "6")) for n in range(6)]
+    camera = Camera(8, 6, 9, 9, 4, 3, np.eye(4))
+    none = SparseModel({}, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8), {})
+    models = []
+    for found in (apart, shared or []):
+        names = [photo.file.name for photo in photos[: len(found)]]
+        agreement = dict(zip(names, found, strict=True))
+        models.append(replace(none, cameras=dict.fromkeys(names, camera), agreement=agreement))
+    jobs: list[list[list[str]]] = []
+
+    def read(arrays: dict[str, object], _: object) -> SparseModel:
+        jobs.append(arrays["groups"])
+        if not (model := models[len(jobs) - 1]).cameras:
+            raise InputError("no two photos share enough points")
+        return model
+
+    monkeypatch.setattr(structure_from_motion, "_run", lambda job, folder, progress: job)
+    monkeypatch.setattr(structure_from_motion, "_read_arrays", read)
+    assert structure_from_motion.find_cameras(photos, tmp_path) is models[kept]
+    assert [list(map(len, groups)) for groups in jobs] == [[3, 3], [6]][: 1 if shared is None else 2]

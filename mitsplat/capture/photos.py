@@ -54,6 +54,7 @@ _PLAIN_BORDER = 0.5
 
 _LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 """EXIF data that differ between cameras and zoom settings."""
+
 _MAX_LABEL = 50
 """Largest value of a mask that stores labels in place of white."""
 

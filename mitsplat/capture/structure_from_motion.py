@@ -127,10 +127,10 @@ def find_cameras(photos: Sequence[Prepared], folder: Path, progress: Progress | 
         InputError: If no two photos share enough points to start with.
         MissingResourceError: If COLMAP aborts its process.
     """
-    model = _reconstruct(photos, lens_groups(photos), folder, progress)
-    shared = lens_groups(photos, by_folder=False)
+    groups, shared = lens_groups(photos), lens_groups(photos, by_folder=False)
+    model = _reconstruct(photos, groups, folder, progress)
     # Folders of few photos can be of one camera, whose intrinsics need all of them.
-    if len(model.cameras) < ENOUGH * len(photos) and len(shared) < len(lens_groups(photos)):
+    if len(model.cameras) < ENOUGH * len(photos) and len(shared) < len(groups):
         with suppress(InputError):
             model = max(model, _reconstruct(photos, shared, folder / "shared", progress), key=_count_sure)
     return model

@@ -45,7 +45,7 @@ _MAX_HIDDEN = 0.5
 _INPUTS = "inputs.json"
 _PHOTOS = "sfm/photos.json"
 """Record of the inputs of the photo copies; written before the copies."""
-_RESULT_FIELDS = ("source", "reprojection_error", "doubtful", "unnamed", "copies")
+_RESULT_FIELDS = ("given", "source", "reprojection_error", "doubtful", "unnamed", "copies")
 """Fields of a result that ``inputs.json`` stores in addition to the inputs."""
 
 
@@ -235,9 +235,7 @@ def _load_finished(out: Path, inputs: JsonObject) -> CaptureResult | None:
         if record["inputs"] != inputs or not (out / "capture.png").is_file():
             return None
         capture = Capture.load(out)
-        stored = {key: record[key] for key in _RESULT_FIELDS}
-        count = len(record["inputs"]["photos"]) - len(stored["unnamed"]) - len(stored["copies"])
-        return CaptureResult(capture, count, **stored)
+        return CaptureResult(capture, **{key: record[key] for key in _RESULT_FIELDS})
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged: recompute
         return None
 

@@ -5,16 +5,15 @@ Other files in that folder are never removed. Folders of a dataset must not be l
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from contextlib import suppress
-from hashlib import sha256
 from pathlib import Path
 
 from mitsplat.errors import InputError
 from mitsplat.formats.registry import TABLE
 from mitsplat.formats.yolo import TASKS
+from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import SPLITS, JsonObject, read_json
 
 CONTENT = "dataset.json"
@@ -67,12 +66,14 @@ def layout_file(index: int) -> str:
     return f"layouts/{index:04d}.json"
 
 
-def hash_poses(layout: JsonObject) -> bytes:
+def hash_poses(layout: JsonObject) -> str:
     """Return the SHA-256 of the objects of a layout in JSON and of their poses; of its number if it has no objects.
 
     Layouts without objects have no poses that training and validation could have in common.
     """
-    return sha256(json.dumps(layout["instances"] or layout["index"]).encode()).digest()
+    digest = ContentHash()
+    digest.add_json(layout["instances"] or layout["index"])
+    return digest.hexdigest()
 
 
 def is_unfinished(name: str) -> bool:

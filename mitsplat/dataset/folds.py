@@ -108,7 +108,7 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
 
 def _first_of_equal(root: Path, records: Iterable[Record]) -> dict[int, int]:
     """Return the first layout of equal poses for each layout of a dataset of frames made in Python."""
-    found, first = dict[bytes, int](), dict[int, int]()
+    found, first = dict[str, int](), dict[int, int]()
     for number in (record["layout"] for record in records):
         path = root / layout_file(number)
         try:

@@ -59,7 +59,7 @@ def write_frames(scene: Scene, out: str | Path, frames: Iterable[Frame], *, over
     catalogue = Catalogue.of(scene)
     device = current_device().kind
     content = content_of(one_view, catalogue, device) | {"given": True}
-    counts, splits = FrameCounts(), dict[bytes, Split]()
+    counts, splits = FrameCounts(), dict[str, Split]()
     with open_folder(out, content, scene.path, None, resume=False, overwrite=overwrite) as manifest:
         append_run(out, 1, device)
         pairs = with_successor(frames) if "flow" in output.formats else ((frame, None) for frame in frames)

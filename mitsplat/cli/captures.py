@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from mitsplat.cli.console import stage_bar
-from mitsplat.cli.options import check_new, parse_pair
+from mitsplat.cli.options import check_new, parse_number, parse_pair
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
@@ -30,8 +30,9 @@ MaskModel = Annotated[
     Path | None, typer.Option(help="Segmentation network (.onnx) that computes the masks through rembg.")
 ]
 ScaleFrom = Annotated[
-    tuple[str, str, float] | None,
+    tuple[str, str, str] | None,  # parse_distance reads the number: a parser of Typer reads all members of a tuple
     typer.Option(
+        "--scale-from",
         metavar="A B METRES",
         help="Known distance between two points. Each of A and B is PHOTO (the centre of its camera) or PHOTO:X,Y (the "
         "surface at this pixel).",
@@ -94,7 +95,7 @@ def capture(
         max_size=max_size,
         board=_parse_board(squares, square),
         tag=tag,
-        scale_from=scale_from,
+        scale_from=parse_distance(scale_from),
         poses=poses,
         metric=metric,
         masks=masks,
@@ -123,6 +124,20 @@ def capture(
     typer.echo(f"picture: {out / 'capture.png'}")
     if result.shortcoming is not None:
         raise PartialResultError(f"{out}: {result.shortcoming}")
+
+
+def parse_distance(scale_from: tuple[str, str, str] | None) -> tuple[str, str, float] | None:
+    """Return the value of ``--scale-from`` with its number.
+
+    Raises:
+        BadParameter: If METRES is no number.
+    """
+    if scale_from is None:
+        return None
+    try:
+        return (scale_from[0], scale_from[1], parse_number(scale_from[2]))
+    except typer.BadParameter as error:
+        raise typer.BadParameter(f"METRES {error.message}", param_hint="'--scale-from'") from None
 
 
 def board(

@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mitsplat.cli.captures import Box, Frames, MaskModel, Masks, Photos, Picks, PicksNot, Poses, ScaleFrom
+from mitsplat.cli.captures import (
+    Box,
+    Frames,
+    MaskModel,
+    Masks,
+    Photos,
+    Picks,
+    PicksNot,
+    Poses,
+    ScaleFrom,
+    parse_distance,
+)
 from mitsplat.cli.console import progress_bar, select_device, stage_bar
 from mitsplat.cli.options import (
     AssetFolder,
@@ -291,7 +302,7 @@ def asset(
     capture = CaptureSettings(
         kind=kind,
         frames=frames,
-        scale_from=scale_from,
+        scale_from=parse_distance(scale_from),
         poses=poses,
         masks=masks,
         mask_model=mask_model,

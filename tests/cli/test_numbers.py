@@ -71,3 +71,13 @@ def test_a_size_consists_of_ascii_digits(
 ) -> None:
     assert run("preview", scene_path, "-o", tmp_path / "a.png", "--size", text) == 2
     assert "--size must be WIDTHxHEIGHT in pixels, such as 1280x720 (got " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["capture", "asset"])
+@pytest.mark.parametrize("text", ["1_000", "٣.5", "0-3", "0x10", "half", ""])
+def test_a_known_distance_is_read_as_it_is_written(
+    command: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The number is the last member of a tuple with text."""
+    assert run(command, tmp_path, "-o", tmp_path / "out", "--scale-from", "a.jpg", "b.jpg:3,4", text) == 2
+    assert f"'--scale-from': METRES must be a number, such as 0.5 (got {text})" in capsys.readouterr().err

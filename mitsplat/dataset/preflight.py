@@ -83,11 +83,11 @@ def run_faults(
         workers: Number of processes that render frames.
         elsewhere: True if frames are rendered on other machines, whose memory is not checked.
     """
+    frames = range(min(scene.num_frames, MAX_FRAMES)) if frames is None else frames
     yield from count_faults(scene)
     yield from layout_faults(scene)
     if not elsewhere:
-        yield from image_faults(scene, workers)
-    frames = range(min(scene.num_frames, MAX_FRAMES)) if frames is None else frames
+        yield from image_faults(scene, workers, len(frames))
     yield from label_faults(scene, frames)
     yield from disk_faults(len(frames), out)
 
@@ -171,17 +171,24 @@ def _room_faults(
         yield fault("room", text, "lower objects[].count or make region larger")
 
 
-def image_faults(scene: Scene, workers: int | None = None) -> Iterator[Finding]:
-    """Check that this machine has enough memory for one image, and for one image per worker."""
+def image_faults(scene: Scene, workers: int | None = None, frames: int = MAX_FRAMES) -> Iterator[Finding]:
+    """Check that this machine has enough memory for one image, and for one image per worker.
+
+    Args:
+        scene: Scene to render.
+        workers: Number of processes that render frames.
+        frames: Number of frames, which is the maximum number of processes that are started.
+    """
     output, free = scene.spec.output, unused_memory()
     need = MIN_PROCESS_GIB + output.width * output.height * MIN_PIXEL_BYTES / 2**30
     size = f"an image of {output.width}x{output.height} px"
     if need > free:
         text = f"output: {size} takes at least {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
         yield fault("memory", text, "lower output.width and height")
-    elif workers is not None and workers * need > free:
-        text = f"workers: {workers} that each render {size} take at least {workers * need:.0f} GiB of memory"
-        yield fault("memory", f"{text} ({free:.1f} GiB are unused)", "use fewer workers")
+    elif workers is not None and min(workers, frames) * need > free:
+        text = f"workers must be at most {int(free / need)}, because each takes at least {need:.1f} GiB of memory for"
+        remedy = "without a number, cores and memory determine it"
+        yield fault("memory", f"{text} {size} ({free:.1f} GiB are unused; got {workers})", remedy)
 
 
 def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:

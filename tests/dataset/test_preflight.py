@@ -187,6 +187,27 @@ def test_an_image_larger_than_the_memory_is_refused_before_rendering(scene_data,
     assert fault.text == "output: an image of 8000x6000 px takes at least 22.9 GiB of memory (22.5 GiB are unused)"
 
 
+@pytest.mark.usefixtures("machine")
+def test_more_workers_than_the_memory_holds_are_refused_with_their_bound(scene_data, write_scene, tmp_path, capsys):
+    scene_data["output"] |= {"layouts": 20, "views": 1, "width": 640, "height": 360}
+    path = write_scene(scene_data)
+    assert run("render", path, "-o", tmp_path / "out", "--workers", 100_000) == 3
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f"mitsplat: {path}: workers must be at most 13, because each takes at least 0.6 GiB of memory for an image of "
+        "640x360 px (8.0 GiB are unused; got 100000); without a number, cores and memory determine it"
+    )
+    assert not (tmp_path / "out").exists()
+    scene = load_scene(path)
+    assert list(run_faults(scene, workers=13)) == []
+    assert [fault.name for fault in run_faults(scene, workers=14)] == ["memory"]
+
+
+@pytest.mark.usefixtures("machine")
+def test_at_most_one_worker_per_image_needs_memory(scene_data, write_scene):
+    scene_data["output"] |= {"layouts": 20, "views": 1, "width": 640, "height": 360}
+    assert list(run_faults(load_scene(write_scene(scene_data)), range(12), workers=100_000)) == []
+
+
 def test_the_cost_of_checks_does_not_grow_with_layouts(scene_data, write_scene, monkeypatch):
     planned = []
     for module in (prospects, warnings_module):

@@ -278,7 +278,7 @@ def settle(
     check_output_file(out, ".gif")
     from rich.console import Console
 
-    from mitsplat.dataset.preflight import count_faults, layout_faults, refuse
+    from mitsplat.dataset.preflight import count_faults, layout_faults, refuse, worker_faults
     from mitsplat.frames.settle_preview import certificate_table, write_preview
     from mitsplat.physics.settle import settle_layouts
     from mitsplat.scene.loading.scene_loading import load_scene
@@ -289,7 +289,7 @@ def settle(
         raise InputError(
             f"--layouts must be 1 to {loaded.spec.output.layouts}, the scene's output.layouts (got {wanted})"
         )
-    refuse(loaded, chain(count_faults(loaded), layout_faults(loaded)))
+    refuse(loaded, chain(count_faults(loaded), layout_faults(loaded), worker_faults(workers, wanted)))
     with Console(stderr=True).status("settling") as status:
         found = settle_layouts(loaded, range(wanted), workers=workers, progress=status.update)
         settled = sorted(found, key=lambda layout: layout.index)

@@ -41,8 +41,8 @@ MIN_VIEW_WIDTH = 0.01
 MIN_PIXEL_BYTES, MIN_PROCESS_GIB = 500, 0.5
 """Minimum peak memory per pixel of a frame [bytes], and of a process in addition [GiB].
 
-Measured with the workcell scene: 1.0 GiB at 640x360, 2.6 GiB at 2000x2000, 8.4 GiB at 4000x4000. Other scenes need
-more, up to the estimate of :func:`mitsplat.frames.budget.worker_memory`.
+Measured with the workcell scene: 1.0 GiB at 640x360, 2.6 GiB at 2000x2000, 8.4 GiB at 4000x4000, and 0.7 GiB for a
+process that settles layouts. Other scenes need more, up to :func:`mitsplat.frames.budget.worker_memory`.
 """
 MIN_FRAME_BYTES = 8192
 """Minimum disk space of a frame [bytes]: one block for the image, one for the label."""
@@ -185,10 +185,20 @@ def image_faults(scene: Scene, workers: int | None = None, frames: int = MAX_FRA
     if need > free:
         text = f"output: {size} takes at least {need:.1f} GiB of memory ({free:.1f} GiB are unused)"
         yield fault("memory", text, "lower output.width and height")
-    elif workers is not None and min(workers, frames) * need > free:
-        text = f"workers must be at most {int(free / need)}, because each takes at least {need:.1f} GiB of memory for"
+    elif workers is not None:
         remedy = "without a number, cores and memory determine it"
-        yield fault("memory", f"{text} {size} ({free:.1f} GiB are unused; got {workers})", remedy)
+        yield from worker_faults(workers, frames, need, f" for {size}", remedy)
+
+
+def worker_faults(
+    workers: int, jobs: int, need: float = MIN_PROCESS_GIB, work: str = "", remedy: str = "use fewer workers"
+) -> Iterator[Finding]:
+    """Check that this machine has enough memory for the processes of some jobs, of which each needs ``need`` GiB."""
+    free = unused_memory()
+    fitting = max(1, int(free / need))
+    if min(workers, jobs) > fitting:
+        text = f"workers must be at most {fitting}, because each takes at least {need:.1f} GiB of memory{work}"
+        yield fault("memory", f"{text} ({free:.1f} GiB are unused; got {workers})", remedy)
 
 
 def disk_faults(frames: int, out: Path | None) -> Iterator[Finding]:

@@ -203,6 +203,16 @@ def test_more_workers_than_the_memory_holds_are_refused_with_their_bound(scene_d
 
 
 @pytest.mark.usefixtures("machine")
+def test_more_workers_than_the_memory_holds_settle_nothing(scene_data, write_scene, capsys):
+    path = write_scene({**scene_data, "output": {**scene_data["output"], "layouts": 20}})
+    assert run("settle", path, "--workers", 100_000) == 3
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f"mitsplat: {path}: workers must be at most 16, because each takes at least 0.5 GiB of memory (8.0 GiB are "
+        "unused; got 100000); use fewer workers"
+    )
+
+
+@pytest.mark.usefixtures("machine")
 def test_at_most_one_worker_per_image_needs_memory(scene_data, write_scene):
     scene_data["output"] |= {"layouts": 20, "views": 1, "width": 640, "height": 360}
     assert list(run_faults(load_scene(write_scene(scene_data)), range(12), workers=100_000)) == []

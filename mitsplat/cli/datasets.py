@@ -174,6 +174,11 @@ def render(
                 any_device=any_device,
             )
         _print_summary(summary, whole=part is None)
+        if part is None and summary.frames > (wanted := loaded.num_frames if frames is None else frames):
+            typer.echo(
+                f"kept: all {summary.frames} images of {out}, although only {wanted} are asked for; --overwrite "
+                "removes them and renders anew"
+            )
 
 
 def _refuse_ineffective(given: set[str], scene: Path, *, only: int | None, engine: str) -> None:

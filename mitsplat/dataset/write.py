@@ -25,7 +25,7 @@ from collections.abc import Generator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 
 from mitsplat.arguments import check_whole_number, path_of
@@ -167,8 +167,10 @@ def write_dataset(
             note(f"device {used_device}: {used_device.reason}")
         if layouts:
             _begin_run(out, workers, used_device)
-        incomplete = IncompleteLayouts(scene, -(-count // scene.spec.output.views))
-        for layout in sorted({layout_index_of(scene, index) for index in indices}):
+        # The dataset may have more frames than were asked for.
+        present = sorted({layout_index_of(scene, index) for index in chain(indices, manifest.indices)})
+        incomplete = IncompleteLayouts(scene, max(-(-count // scene.spec.output.views), len(present)))
+        for layout in present:
             incomplete.read(out / layout_file(layout))
         job = FrameJob(scene, catalogue, out, render or render_frame, settle or settle_layout)
         num_missing = sum(map(len, layouts.values()))

@@ -47,6 +47,19 @@ def test_render_passes_every_option_on(
     assert lines[-1] == f"contact sheet: {tmp_path / 'out/contact_sheet.jpg'}"
 
 
+def test_render_states_that_a_dataset_keeps_more_images_than_asked_for(
+    scene_path: Path, write_dataset: Calls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run("render", scene_path, "-o", out, "-n", 2) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == (
+        f"kept: all 3 images of {out}, although only 2 are asked for; --overwrite removes them and renders anew"
+    )
+    for options in (["-n", 3], [], ["-n", 2, "--shard", "1/1"]):
+        assert run("render", scene_path, "-o", out, *options) == 0
+        assert "kept:" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("made", "status", "told"),
     [

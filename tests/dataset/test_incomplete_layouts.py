@@ -144,5 +144,19 @@ def test_more_incomplete_layouts_than_allowed_end_the_run(scene: Scene, tmp_path
     assert write(few, tmp_path / "part", shard=Shard(2, 2)).incomplete == 1
 
 
+def test_a_finished_dataset_accepts_a_request_for_fewer_images(
+    scene: Scene, whole: DatasetSummary, tmp_path: Path
+) -> None:
+    """Of the first 3 layouts, 1 lacks objects: more than 0.25 of these, but not of the 8 that exist."""
+    shutil.copytree(whole.path, tmp_path / "out")
+    summary = write(scene, tmp_path / "out", frames=6)
+    assert (summary.frames, summary.rendered, summary.incomplete) == (16, 0, 2)
+    assert files_of(tmp_path / "out") == files_of(whole.path)
+    with pytest.raises(InputError, match=r"settle.incomplete = 0.2 of the 8 layouts may lack .*got 2"):
+        write(with_share(scene, 0.2), tmp_path / "out", frames=4)  # 0 of 2
+    with pytest.raises(InputError, match=r"settle.incomplete = 0.25 of the 3 layouts may lack .*got 1"):
+        write(scene, tmp_path / "new", frames=6)
+
+
 def test_the_allowed_share_is_not_recorded_as_an_input(whole: DatasetSummary) -> None:
     assert "incomplete" not in (whole.path / "dataset.json").read_text()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mitsplat.cli.console import command_log
+from mitsplat.cli.console import command_log, format_counts
 from mitsplat.cli.options import JsonLog, Seed, check_ending
 
 if TYPE_CHECKING:
@@ -171,8 +171,8 @@ def compare(
     """Compare rendered images with labelled photographs.
 
     The command compares the brightness, colours, size and number of objects, and the brightness and noise of images,
-    in total and per class. Where photographs lie outside the range of the rendered images, the output suggests a
-    change to the scene.
+    in total and per class. Labels of classes that only one side has are not compared, but counted by class. Where
+    photographs lie outside the range of the rendered images, the output suggests a change to the scene.
     """
     from mitsplat.detector.likeness import compare_with_photographs
     from mitsplat.storage.files import write_text
@@ -180,6 +180,15 @@ def compare(
     check_ending(out, ".json")
     with command_log(json_log, "compare") as progress_bars, progress_bars() as progress:
         found = compare_with_photographs(datasets, photographs, split=split, size=size, progress=progress)
+    for side, other, counts, skipped in (
+        ("rendered images", "photographs", found.only_rendered, found.skipped[0]),
+        ("photographs", "rendered images", found.only_photographed, found.skipped[1]),
+    ):
+        if counts:
+            typer.echo(
+                f"not compared: labels in {side} of classes that {other} do not have: {format_counts(counts)}"
+                + (f"; {skipped} {side} have no other labels and are left out" if skipped else "")
+            )
     typer.echo(f"{found.images} rendered images, {found.photographs} photographs; 5 %, median and 95 %:")
     for trait in found.traits:
         _print_trait(trait.name, trait)

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsplat.detector.detector_report import make_report
-from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, Sample, Split, check_masks, reorder_classes
+from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, Sample, Split, check_masks, match_classes
 from mitsplat.detector.labelled_sets.pictures import read_upright
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import (
@@ -91,7 +91,8 @@ def evaluate_detector(
 
     Args:
         run: Folder of a finished training.
-        data: A mitsplat dataset, a YOLO folder or a COCO folder.
+        data: A mitsplat dataset, a YOLO folder or a COCO folder. Labels of classes that the detector does not have are
+            not used; a warning names them.
         out: Output folder; ``evaluation/<name of data>-<split>`` in the run by default. An existing evaluation is
             replaced.
         split: Split of the images to evaluate.
@@ -100,9 +101,9 @@ def evaluate_detector(
         progress: Called after each image.
 
     Raises:
-        InputError: If the run is not finished, the images do not satisfy :func:`mitsplat.detector.read_set`, the
-            classes differ, or the detector predicts masks and the labels are only boxes. Also if ``out`` contains the
-            images or unrelated files.
+        InputError: If the run is not finished, the images do not satisfy :func:`mitsplat.detector.read_set`, the data
+            lack a class of the detector, or the detector predicts masks and the labels are only boxes. Also if ``out``
+            contains the images or unrelated files.
         MissingResourceError: If Ultralytics or the GPU is missing.
     """
     trained, root = open_run(run), Path(data)
@@ -110,7 +111,7 @@ def evaluate_detector(
     size = int(trained.record["settings"]["size"]) if size is None else size
     if size < STRIDE or size % STRIDE:
         raise InputError(f"--size must be a multiple of {STRIDE} px (got {size})")
-    found = reorder_classes(read_set(root, split, progress), trained.class_names, str(trained.path))
+    found = match_classes(read_set(root, split, progress), trained.class_names, str(trained.path))
     if trained.has_masks:
         check_masks(found)
     name = f"{root.resolve().name}-{split}"

@@ -56,6 +56,8 @@ def _summary(
         f"At a score of {CONFIDENCE} and an IoU of {IOU}": f"{right} correct, {confused} with the wrong "
         f"class, {missed} missed; {extra} false detections",
         "Images": f"{len(found.samples)} of {found.root} ({found.split})",
+        "Labels of other classes, not used": ", ".join(f"{count} {name}" for name, count in found.other_labels.items())
+        or "none",
         "Run": str(results.get("run", "unknown")),
         "Images scaled to": f"{results['size']} px" if "size" in results else "unknown",
         "Device": str(results.get("device", "unknown")),

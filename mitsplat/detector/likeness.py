@@ -10,9 +10,9 @@ distribution this share is 10 %.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from mitsplat.arrays import BoolArray, ByteImage, Float64Array, evenly_spaced
-from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, Sample, Split, reorder_classes
+from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, LabelledSet, Sample, Split, select_classes
 from mitsplat.detector.labelled_sets.pictures import read_upright
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import STRIDE
@@ -117,6 +117,12 @@ class Likeness:
         classes: Brightness and saturation of each class that is frequent enough on both sides.
         hues: Hue shift of the photographs from red towards green [degrees], for each of these classes where it can be
             measured.
+        only_rendered: Number of rendered labels of classes that the photographs do not have, by class. These labels are
+            not compared.
+        only_photographed: Number of labels of classes that the rendered images do not have, by class. These labels are
+            not compared.
+        skipped: Numbers of rendered images and of photographs whose labels are all of such classes. These images are
+            not compared.
     """
 
     images: int
@@ -126,6 +132,9 @@ class Likeness:
     traits: tuple[Trait, ...]
     classes: dict[str, tuple[Trait, ...]]
     hues: dict[str, float]
+    only_rendered: dict[str, int] = field(default_factory=dict)
+    only_photographed: dict[str, int] = field(default_factory=dict)
+    skipped: tuple[int, int] = (0, 0)
 
     @property
     def hue_advice(self) -> str:
@@ -150,8 +159,9 @@ def compare_with_photographs(
     Colours are measured at pixels inside masks, or in the middle half of boxes without masks.
 
     Args:
-        rendered: mitsplat datasets, YOLO folders or COCO folders with the same classes.
-        photographs: A folder of the same kinds; all splits are used. The order of its classes may differ.
+        rendered: mitsplat datasets, YOLO folders or COCO folders.
+        photographs: A folder of the same kinds; all splits are used. Classes are matched by name. Classes that only one
+            side has are not compared, but counted in the result.
         split: Split of the rendered images.
         size: Longer side to which images are scaled before measurement [px].
         max_images: Maximum number of images of each side, drawn at equal intervals.
@@ -165,12 +175,20 @@ def compare_with_photographs(
     if max_images < 1:
         raise InputError(f"the number of images per side must be at least 1 (got {max_images})")
     real = read_set(photographs, "all")
-    sets = [reorder_classes(read_set(one, split), real.class_names, str(photographs)) for one in rendered]
+    sets = [read_set(one, split) for one in rendered]
     if not sets:
         raise InputError("there are no rendered images to compare")
-    rendered_samples = [sample for one in sets for sample in one.samples]
-    ours = [rendered_samples[i] for i in evenly_spaced(len(rendered_samples), max_images)]
-    theirs = [real.samples[i] for i in evenly_spaced(len(real.samples), max_images)]
+    rendered_names = {name for one in sets for name in one.class_names}
+    names = [name for name in real.class_names if name in rendered_names]
+    if not names:
+        raise InputError(
+            f"{photographs}: must have a class of the rendered images, which are {', '.join(sorted(rendered_names))} "
+            f"(got {', '.join(real.class_names)})"
+        )
+    rendered_side, real_side = _common_part(sets, names), _common_part([real], names)
+    ours, theirs = (
+        [side.samples[i] for i in evenly_spaced(len(side.samples), max_images)] for side in (rendered_side, real_side)
+    )
     sides: tuple[_Values, _Values] = defaultdict(list), defaultdict(list)
     hues: tuple[_HueSums, _HueSums] = defaultdict(_zero_hue_sums), defaultdict(_zero_hue_sums)
     for number, sample in enumerate(ours + theirs):
@@ -180,16 +198,62 @@ def compare_with_photographs(
     least = MIN_RENDERED_OBJECTS, MIN_REAL_OBJECTS
     classes = {
         name: _traits(sides, index)
-        for index, name in enumerate(real.class_names)
+        for index, name in enumerate(names)
         if all(len(side.get((BRIGHTNESS, index), [])) >= few for side, few in zip(sides, least, strict=True))
     }
     turned = {
         name: turn
-        for index, name in enumerate(real.class_names)
+        for index, name in enumerate(names)
         if name in classes and (turn := _hue_shift(hues[0][index], hues[1][index])) is not None
     }
-    same_size, same_sizes = _equal_sizes(_size_ratios(sides, len(real.class_names)), size)
-    return Likeness(len(ours), len(theirs), same_size, same_sizes, _traits(sides, None), classes, turned)
+    same_size, same_sizes = _equal_sizes(_size_ratios(sides, len(names)), size)
+    return Likeness(
+        len(ours),
+        len(theirs),
+        same_size,
+        same_sizes,
+        _traits(sides, None),
+        classes,
+        turned,
+        rendered_side.other_labels,
+        real_side.other_labels,
+        (rendered_side.skipped, real_side.skipped),
+    )
+
+
+@dataclass(frozen=True)
+class _Side:
+    """Images of one side with the labels of the common classes; other attributes as of :class:`Likeness`."""
+
+    samples: list[Sample]
+    other_labels: dict[str, int]
+    skipped: int
+
+
+def _common_part(sets: Sequence[LabelledSet], names: Sequence[str]) -> _Side:
+    """Return the labels of the common classes ``names``, without images whose labels are all of other classes.
+
+    Raises:
+        InputError: If no label is left.
+    """
+    samples: list[Sample] = []
+    others, skipped = Counter[str](), 0
+    for one in sets:
+        chosen = select_classes(one, names)
+        others.update(chosen.other_labels)
+        kept = [
+            after
+            for before, after in zip(one.samples, chosen.samples, strict=True)
+            if after.instances or not before.instances
+        ]
+        samples += kept
+        skipped += len(one.samples) - len(kept)
+    if not any(sample.instances for sample in samples):
+        raise InputError(
+            f"{sets[0].root}: must have labels of a class that both sides have, {', '.join(names)} "
+            f"(got {', '.join(sorted(others))})"
+        )
+    return _Side(samples, dict(sorted(others.items())), skipped)
 
 
 def _traits(sides: tuple[_Values, _Values], index: int | None) -> tuple[Trait, ...]:

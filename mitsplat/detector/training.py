@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, check_masks, reorder_classes
+from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, check_masks, match_classes, reorder_classes
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import check_weights, load_libraries, read_network, torch_device, versions
 from mitsplat.detector.mix import plan_images
@@ -90,14 +90,15 @@ def train_detector(
         out: Folder of the run. An interrupted run resumes from its last checkpoint and ends at the same number of
             steps.
         settings: Training settings.
-        real: Labelled photographs, which make up ``settings.share`` of the images.
+        real: Labelled photographs, which make up ``settings.share`` of the images. Labels of classes that the datasets
+            do not have are not used; a warning names them.
         overwrite: Remove an existing run in the folder first.
         progress: Called after each image that is read, and after each step.
 
     Raises:
-        InputError: If images or labels are missing, truncated or out of range, the classes differ, or a mask model gets
-            box labels. Also if the weights do not fit, ``real_size`` is set without photographs, or the folder contains
-            other files or a run with other settings.
+        InputError: If images or labels are missing, truncated or out of range, the classes of datasets differ, the
+            photographs lack a class, or a mask model gets box labels. Also if the weights do not fit, ``real_size`` is
+            set without photographs, or the folder contains other files or a run with other settings.
         MissingResourceError: If Ultralytics or the GPU is missing, or the GPU memory is too small.
     """
     settings, out = settings or TrainSettings(), Path(out)
@@ -165,15 +166,16 @@ def read_sets(
         InputError: As :func:`train_detector`.
     """
     found = [read_set(path, "train", progress) for path in datasets]
+    classes, owner = found[0].class_names, str(found[0].root)
+    found = [reorder_classes(one, classes, owner) for one in found]
     if real is not None:
-        found.append(read_set(real, "train", progress))
+        found.append(match_classes(read_set(real, "train", progress), classes, owner))
     for one in found:
         if all(instance.crowd for sample in one.samples for instance in sample.instances):
             raise InputError(
                 f"{one.root}: all labels are crowds, which cannot be used for training; set iscrowd to 0 if each is "
                 "one object, because CVAT exports masks as crowds"
             )
-    found = [reorder_classes(one, found[0].class_names, str(found[0].root)) for one in found]
     if masks:
         for one in found:
             check_masks(one)

@@ -159,10 +159,57 @@ def test_most_limits_both_image_counts(rendered: Path, photographs: Path) -> Non
     assert (found.images, found.photographs) == (7, 7)
 
 
-def test_photographs_with_other_classes_are_refused(rendered: Path, tmp_path: Path) -> None:
-    other = write_yolo(tmp_path / "other", {"train": 2}, classes=("disc", "box", "cone"))
-    with pytest.raises(InputError, match="it lacks cone"):
+def _rename(root: Path, **names: str) -> Path:
+    """Rename classes of a YOLO folder."""
+    text = (root / "data.yaml").read_text()
+    for old, new in names.items():
+        text = text.replace(old, new)
+    (root / "data.yaml").write_text(text)
+    return root
+
+
+def _without(root: Path, index: int) -> Path:
+    """Remove the labels of a class from a YOLO folder, and images that had no others."""
+    for path in root.glob("labels/*/*.txt"):
+        lines = [line for line in path.read_text().splitlines(keepends=True) if not line.startswith(f"{index} ")]
+        path.write_text("".join(lines))
+        if not lines:
+            next(root.glob(f"images/*/{path.stem}.png")).unlink()
+            path.unlink()
+    return root
+
+
+def test_common_classes_are_compared_and_others_are_named(rendered: Path, tmp_path: Path) -> None:
+    """Classes that one side does not have change no value: the result is that of the common labels alone."""
+    other = _rename(write_yolo(tmp_path / "other", {"train": 20}, first=1000), box="cone")
+    cones = sum(line.startswith("1 ") for path in other.glob("labels/*/*") for line in path.read_text().splitlines())
+    boxes = sum(line.startswith("1 ") for path in rendered.glob("labels/*/*") for line in path.read_text().splitlines())
+    found = compare_with_photographs([rendered], other, size=WIDTH)
+    assert (found.only_rendered, found.only_photographed) == ({"box": boxes}, {"cone": cones})
+    assert list(found.classes) == ["disc"]
+    discs = _without(write_yolo(tmp_path / "discs", {"train": 20}, first=1000), 1)
+    rendered_discs = _without(write_yolo(tmp_path / "rendered", {"train": 40}), 1)
+    alone = compare_with_photographs([rendered_discs], discs, size=WIDTH)
+    assert (alone.only_rendered, alone.only_photographed, alone.skipped) == ({}, {}, (0, 0))
+    assert (found.traits, found.classes, found.hues) == (alone.traits, alone.classes, alone.hues)
+    assert found.skipped == (40 - alone.images, 20 - alone.photographs) and all(found.skipped)
+    done = CliRunner().invoke(app, ["compare", str(rendered), str(other), "--size", str(WIDTH)])
+    assert done.stdout.startswith(
+        f"not compared: labels in rendered images of classes that photographs do not have: {boxes} box; "
+        f"{found.skipped[0]} rendered images have no other labels and are left out\n"
+        f"not compared: labels in photographs of classes that rendered images do not have: {cones} cone; "
+    )
+
+
+def test_sides_without_a_common_label_are_refused(rendered: Path, tmp_path: Path) -> None:
+    other = _rename(write_yolo(tmp_path / "other", {"train": 2}), box="cone", disc="ring")
+    with pytest.raises(
+        InputError, match=r"must have a class of the rendered images, which are box, disc \(got ring, co"
+    ):
         compare_with_photographs([rendered], other)
+    cones = _rename(_without(write_yolo(tmp_path / "cones", {"train": 9}), 0), box="cone")
+    with pytest.raises(InputError, match=r"cones: must have labels of a class that both sides have, disc \(got cone\)"):
+        compare_with_photographs([rendered], cones)
     with pytest.raises(InputError, match="at least 1"):
         compare_with_photographs([rendered], rendered, max_images=0)
 

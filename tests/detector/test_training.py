@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
@@ -21,17 +22,17 @@ from typer.testing import CliRunner
 
 from mitsplat.cli import app
 from mitsplat.detector import libraries
-from mitsplat.detector.detector_evaluation import coco_truth, evaluate_detector
+from mitsplat.detector.detector_evaluation import coco_truth, evaluate_detector, write_evaluation
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.detector.libraries import check_weights, load_weights
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.scores import DetectionMatches
 from mitsplat.detector.train_settings import TrainSettings
-from mitsplat.detector.training import RUN_FILE, Run, open_run, train_detector, write_data
+from mitsplat.detector.training import RUN_FILE, Run, open_run, read_sets, train_detector, write_data
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.storage.content_hash import file_hash
 from tests.conftest import contents
-from tests.detector.painted import write_coco, write_yolo
+from tests.detector.painted import paint, write_coco, write_yolo
 
 TINY = TrainSettings(model="yolo11n-seg", steps=4, batch=4, size=64, share=0.25, device="cpu")
 
@@ -135,6 +136,31 @@ def test_a_run_records_its_datasets_and_settings(no_libraries: list[dict[str, An
     assert not over.was_finished and len(no_libraries) == 2
 
 
+def test_labels_of_other_classes_are_not_used_and_named(
+    no_libraries: list[dict[str, Any]], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Photographs show 2 discs, which the datasets do not have as a class, and 4 boxes."""
+    cell = write_yolo(tmp_path / "cell", {"train": 5}, mitsplat=True)
+    for path in cell.glob("labels/train/*"):
+        path.write_text("".join("0" + line[1:] for line in path.read_text().splitlines(keepends=True)))
+    (cell / "data.yaml").write_text("train: images/train\nnames: [box]\n")
+    photographs = write_coco(tmp_path / "photographs", 3, first=7)
+    before = Counter(name for seed in (7, 8, 9) for name, _ in paint(seed)[1])
+    _, real = read_sets([cell], photographs, masks=True)
+    assert real is not None and real.class_names == ("box",) and dict(real.other_labels) == {"disc": before["disc"]}
+    assert [len(sample.instances) for sample in real.samples] == [1, 2, 1]
+    assert {i.class_index for sample in real.samples for i in sample.instances} == {0}
+    message = f"{photographs}: not used, because {cell} does not have these classes: disc (2 labels)"
+    assert [one.getMessage() for one in caplog.records] == [message]
+    run = train_detector([cell], tmp_path / "run", TINY, real=photographs)
+    assert run.record["real"]["instances"] == {"box": before["box"]}
+    assert run.record["real"]["other_labels"] == {"disc": 2}
+    assert "other_labels" not in run.record["datasets"][0]
+    evaluation = write_evaluation(real, [], tmp_path / "evaluation", masks=True, about={})
+    assert evaluation.results["data"]["other_labels"] == {"disc": 2}
+    assert "Labels of other classes, not used</th><td>2 disc</td>" in evaluation.page.read_text()
+
+
 def test_photographs_are_cut_to_tiles_of_the_test_size(no_libraries: list[dict[str, Any]], tmp_path: Path) -> None:
     cell = write_yolo(tmp_path / "cell", {"train": 5}, mitsplat=True)
     photographs = write_coco(tmp_path / "photographs", 3, first=50)
@@ -198,6 +224,16 @@ def _others(folder: Path) -> None:
     write_yolo(folder / "other", {"train": 1}, classes=("disc", "box", "gear"))
 
 
+def _renamed(folder: Path) -> None:
+    root = write_yolo(folder / "other", {"train": 1})
+    (root / "data.yaml").write_text((root / "data.yaml").read_text().replace("box", "gear"))
+
+
+def _gears(folder: Path) -> None:
+    root = write_yolo(folder / "other", {"train": 1}, classes=("disc", "gear", "box"))
+    (root / "labels/train/000000.txt").write_text("1 0.5 0.5 0.2 0.2\n")
+
+
 def _empty(folder: Path) -> None:
     for path in folder.glob("cell/images/train/*"):
         path.unlink()
@@ -213,7 +249,16 @@ REFUSED: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
     "crowds": (_crowds, {"real": "crowds"}, "crowds: all labels are crowds"),
     "empty": (_empty, {}, r"cell: there are no images for train \(it has 1 for val\)"),
     "classes": (_others, {"more": "other"}, "other: its classes must be those of .*cell: it also has gear"),
-    "real classes": (_others, {"real": "other"}, "other: its classes must be those of .*cell: it also has gear"),
+    "real classes": (
+        _renamed,
+        {"real": "other"},
+        r"other: its classes must be those of .*cell: it also has gear \(1 labels\) and it lacks box",
+    ),
+    "real labels": (
+        _gears,
+        {"real": "other"},
+        r"other: its images must have labels of the classes of .*cell \(got gear \(1 labels\)\)",
+    ),
     "boxes": (_boxes, {"real": "boxes"}, "boxes: a mask model needs mask labels, but photos/p0.png has only boxes"),
     "weights": (
         lambda folder: None,
@@ -523,10 +568,11 @@ def test_precision_agrees_with_ultralytics(data: Path, trained: Run, tmp_path: P
 @pytest.mark.slow
 def test_invalid_evaluation_data_is_refused(data: Path, trained: Run, tmp_path: Path) -> None:
     write_yolo(tmp_path / "boxes", {"val": 1}, boxes=True)
-    write_yolo(tmp_path / "gears", {"val": 1}, classes=("disc", "gear", "box"))
+    gears = write_yolo(tmp_path / "gears", {"val": 1}) / "data.yaml"
+    gears.write_text(gears.read_text().replace("box", "gear"))
     for folder, options, message in (
         ("boxes", {}, "has only boxes"),
-        ("gears", {}, r"gears: its classes must be those of .*run: it also has gear"),
+        ("gears", {}, r"gears: its classes must be those of .*run: it also has gear .* and it lacks box"),
         ("boxes", {"split": "test"}, "there are no images for test"),
         ("boxes", {"size": 100}, r"--size must be a multiple of 32 px \(got 100\)"),
         ("boxes", {"device": "cuda:all"}, "device must be auto, cpu, cuda or cuda:N"),

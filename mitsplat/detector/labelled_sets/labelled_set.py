@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -18,6 +19,8 @@ from mitsplat.labels.polygons import fill_polygon, outline
 from mitsplat.progress import Progress
 from mitsplat.storage.content_hash import ContentHash
 from mitsplat.storage.files import JsonObject
+
+_logger = logging.getLogger(__name__)
 
 Split = Literal["train", "val", "test", "all"]
 
@@ -107,6 +110,7 @@ class LabelledSet:
         split: Split that was read.
         class_names: Names of the classes.
         samples: The images.
+        other_labels: Number of labels of other classes, which were left out, by class.
     """
 
     root: Path
@@ -114,6 +118,7 @@ class LabelledSet:
     split: Split
     class_names: tuple[str, ...]
     samples: tuple[Sample, ...]
+    other_labels: Mapping[str, int] = field(default_factory=dict)
 
     def to_record(self) -> JsonObject:
         """Return the record of the set; its digest covers images, labels and classes."""
@@ -127,6 +132,7 @@ class LabelledSet:
             "images": len(self.samples),
             "instances": {name: counts[i] for i, name in enumerate(self.class_names)},
             "digest": sha.hexdigest(),
+            **({"other_labels": dict(self.other_labels)} if self.other_labels else {}),
         }
 
 
@@ -146,14 +152,48 @@ def reorder_classes(found: LabelledSet, class_names: Sequence[str], owner: str) 
             f"{found.root}: its classes must be those of {owner}: {' and '.join(differences)}; rename its classes, or "
             "remove those without labels"
         )
+    return select_classes(found, class_names)
+
+
+def match_classes(found: LabelledSet, class_names: Sequence[str], owner: str) -> LabelledSet:
+    """Return the set with the classes of a detector alone, which are those of ``owner``.
+
+    A detector must not find objects of other classes, so their labels are left out. A warning names these classes.
+
+    Raises:
+        InputError: If the set lacks a class, because it does not state whether unlabelled objects of this class are
+            absent. Also if no label is left.
+    """
+    if not set(class_names) <= set(found.class_names):
+        return reorder_classes(found, class_names, owner)
+    chosen = select_classes(found, class_names)
+    if chosen.other_labels:
+        others = ", ".join(f"{name} ({count} labels)" for name, count in chosen.other_labels.items())
+        if not any(sample.instances for sample in chosen.samples):
+            raise InputError(f"{found.root}: its images must have labels of the classes of {owner} (got {others})")
+        _logger.warning("%s: not used, because %s does not have these classes: %s", found.root, owner, others)
+    return chosen
+
+
+def select_classes(found: LabelledSet, class_names: Sequence[str]) -> LabelledSet:
+    """Return the set with these classes alone, in this order; labels of its other classes are left out and counted."""
     if tuple(class_names) == found.class_names:
         return found
-    place = [list(class_names).index(name) for name in found.class_names]
-    samples = tuple(
-        replace(sample, instances=tuple(replace(i, class_index=place[i.class_index]) for i in sample.instances))
-        for sample in found.samples
+    place = {name: index for index, name in enumerate(class_names)}
+    new = [place.get(name) for name in found.class_names]
+    samples, others = [], Counter[str]()
+    for sample in found.samples:
+        kept = []
+        for instance in sample.instances:
+            index = new[instance.class_index]
+            if index is None:
+                others[found.class_names[instance.class_index]] += 1
+            else:
+                kept.append(replace(instance, class_index=index))
+        samples.append(replace(sample, instances=tuple(kept)))
+    return replace(
+        found, class_names=tuple(class_names), samples=tuple(samples), other_labels=dict(sorted(others.items()))
     )
-    return replace(found, class_names=tuple(class_names), samples=samples)
 
 
 def check_masks(found: LabelledSet) -> None:

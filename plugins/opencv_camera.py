@@ -96,8 +96,9 @@ class OpenCVCamera(mi.Sensor):
     def sample_ray(  # noqa: D102 - Mitsuba's interface
         self, time: mi.Float, wavelength: mi.Float, position: mi.Point2f, aperture: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.Ray3f, mi.Color3f]:
-        width, height = self.film().size()
-        u, v = self.view().slopes(position.x * width, position.y * height)
+        film = self.film()
+        at = mi.Point2f(film.crop_offset()) + position * mi.Vector2f(film.crop_size())
+        u, v = self.view().slopes(at.x, at.y)
         ray = dr.zeros(mi.Ray3f, dr.width(position))
         to_world = mi.Transform4f(mi.Matrix4f(self.world_from_mitsuba.tolist()))
         radius, focus = self.thin_lens

@@ -36,7 +36,8 @@ def view_of(sensor: mi.Sensor) -> CameraView:
         return float(np.array(params[name]).ravel()[0]) if name in params else default
 
     focal = 0.5 * width / np.tan(0.5 * np.radians(number("x_fov")))
-    centre = [width * (0.5 + number("principal_point_offset_x")), height * (0.5 + number("principal_point_offset_y"))]
+    # Mitsuba adds the offset to the position of a pixel, so that the principal point moves the other way.
+    centre = [width * (0.5 - number("principal_point_offset_x")), height * (0.5 - number("principal_point_offset_y"))]
     # Mitsuba replaces an aperture radius of 0 by its smallest float.
     radius = number("aperture_radius")
     pose = np.array(params["to_world"].matrix, dtype=np.float64).reshape(4, 4) @ np.diag([-1.0, -1.0, 1.0, 1.0])

@@ -230,6 +230,29 @@ except RuntimeError as error:
     assert "plugin 'splat_proxy' needs the variant llvm_ad_rgb or cuda_ad_rgb (got scalar_rgb)" in plugin
 
 
+def test_plugins_refuse_an_llvm_that_would_abort_the_process() -> None:
+    """A script that imports Mitsuba first gets the LLVM of the distribution."""
+    code = """
+import drjit as dr, mitsuba as mi
+dr.detail.llvm_version = lambda: (15, 0, 6)
+mi.set_variant("llvm_ad_rgb")
+import mitsplat
+for kind in ("splat_proxy", "splats", "opencv_camera"):
+    try:
+        mi.load_dict({"type": kind})
+    except RuntimeError as error:
+        print(str(error).splitlines()[-1])
+"""
+    done = fresh(code)
+    assert done.returncode == 0, done.stderr[-2000:]
+    sentences = done.stdout.splitlines()
+    assert len(sentences) == 3
+    for sentence in sentences:
+        assert (
+            "cannot be used: Dr.Jit has loaded LLVM 15.0.6, but needs 16 or newer: import mitsplat before" in sentence
+        )
+
+
 # Errors
 
 FAULT = """

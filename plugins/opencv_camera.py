@@ -48,7 +48,7 @@ class OpenCVCamera(mi.Sensor):
 
      * - near_clip
        - |float|
-       - Smallest visible depth [m]. (Default: 0.01)
+       - Smallest depth at which splats are visible [m]. (Default: 0.01)
 
     Rays are generated through the distorted lens, so that no image is warped afterwards. Other integrators can use the
     sensor too.

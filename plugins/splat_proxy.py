@@ -128,7 +128,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
     them and are occluded by splats in front of them. They cast shadows on splats unless light passes through them.
     Purely diffuse meshes are lit like splats, from both sides, by emitters and by reflected light of the surroundings.
     All other materials of Mitsuba are path traced: metal reflects, and glass shows, splats, meshes and emitters. In
-    reflections, splats that were captured under the scene's light do not show the shadows of added objects.
+    reflections, splats that were captured under the scene's light do not show the shadows of added objects. Surfaces of
+    the material ``null`` are invisible. Participating media are refused.
 
     Radiance is multiplied by pi over ``white``. Splats that were captured under the light of the scene keep their
     colours; state the irradiance of a white surface in their capture as ``white``. With a sky, alpha is 1.

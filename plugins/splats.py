@@ -114,6 +114,8 @@ class SplatsShape(mi.Mesh):
         super().__init__("splats", 3, 1, props=props)
         if self.is_emitter():
             raise InputError("shape 'splats': must not have an emitter: add it to a mesh")
+        for name, _ in props.objects():
+            raise InputError(f"shape 'splats': must not have materials, media or other objects (got {name!r})")
         # Mitsuba requires a mesh; one triangle without area is never hit.
         params = mi.traverse(self)
         params["vertex_positions"] = mi.Float([0.0] * 9)

@@ -107,14 +107,79 @@ def test_an_integrator_around_the_plugin_is_refused_in_one_sentence() -> None:
         around.render(scene, spp=1)
 
 
-def test_instanced_shapes_are_refused_in_one_sentence() -> None:
+def fog(**material: Any) -> dict[str, Any]:
+    return {"type": "cube", "interior": {"type": "homogeneous"}, **material}
+
+
+@pytest.mark.parametrize(
+    ("shape", "sentence"),
+    [
+        (
+            {"type": "instance", "group": {"type": "ref", "id": "group"}},
+            "shapes of type 'instance' are not supported: add the shape at each place",
+        ),
+        (
+            {"type": "ellipsoids", "centers": [0, 0, 0], "scales": [1, 1, 1], "quaternions": [0, 0, 0, 1]},
+            "shapes of type 'ellipsoids' are not supported: load the file with a shape of type 'splats'",
+        ),
+        (
+            {"type": "ellipsoidsmesh", "centers": [0, 0, 0], "scales": [1, 1, 1], "quaternions": [0, 0, 0, 1]},
+            "shapes of type 'ellipsoidsmesh' are not supported: load the file with a shape of type 'splats'",
+        ),
+        (
+            fog(bsdf={"type": "null"}),
+            "participating media are not supported: remove 'interior' and 'exterior' of the shape 'one'",
+        ),
+        (
+            fog(bsdf={"type": "dielectric"}),
+            "participating media are not supported: remove 'interior' and 'exterior' of the shape 'one'",
+        ),
+    ],
+    ids=["instance", "ellipsoids", "ellipsoidsmesh", "fog", "milk"],
+)
+def test_shapes_that_would_be_rendered_wrongly_are_refused_in_one_sentence(
+    shape: dict[str, Any], sentence: str
+) -> None:
     ensure_variant()
-    group = {"type": "shapegroup", "cube": {"type": "cube"}}
-    scene = {"type": "scene", "group": group, "one": {"type": "instance", "group": {"type": "ref", "id": "group"}}}
+    shape |= {key: mi.TensorXf(value, (1, len(value))) for key, value in shape.items() if isinstance(value, list)}
+    scene = {"type": "scene", "group": {"type": "shapegroup", "cube": {"type": "cube"}}, "one": shape}
     sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
     loaded = mi.load_dict(scene | {"sensor": sensor, "part": make_splats_shape(floor())})
-    with pytest.raises(InputError, match=r"^integrator 'splat_proxy': shapes of type 'instance' are not supported"):
+    with pytest.raises(InputError) as error:
         make_integrator().render(loaded)
+    assert str(error.value) == f"integrator 'splat_proxy': {sentence}"
+
+
+def test_surfaces_without_material_are_invisible() -> None:
+    """The material `null` changes no light: there is neither a shadow nor a depth."""
+    box = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.6), "bsdf": {"type": "null"}}
+    sensor = {
+        "type": "perspective",
+        "to_world": mi.ScalarTransform4f().look_at(origin=[0, -1.2, 1], target=[0, 0, 0], up=[0, 0, 1]),
+        "film": {"type": "hdrfilm", "width": 24, "height": 16},
+    }
+    ensure_variant()
+    shared = {
+        "type": "scene",
+        "sensor": sensor,
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "table": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.1]).scale(0.1)},
+        "lamp": {"type": "point", "position": [0.4, 0.5, 1], "intensity": 1.0},
+    }
+    with_box, without = (
+        np.array(make_integrator(shadow_error=0, shadow_samples=16).render(mi.load_dict(shared | box_or_none)))
+        for box_or_none in ({"box": box}, {})
+    )
+    np.testing.assert_array_equal(with_box, without)
+
+
+@pytest.mark.parametrize("name", ["bsdf", "interior"])
+def test_splats_with_a_material_or_medium_are_refused(name: str) -> None:
+    """They would have no effect."""
+    ensure_variant()
+    child = mi.load_dict({"type": "conductor" if name == "bsdf" else "homogeneous"})
+    with pytest.raises(InputError, match=rf"^shape 'splats': must not have materials, .* \(got '{name}'\)$"):
+        make_splats_shape(nothing(), **{name: child})
 
 
 def test_splats_with_an_emitter_are_refused() -> None:

@@ -14,10 +14,17 @@ from mitsplat.renderer.composition.shape_state import ShapeState
 from mitsplat.renderer.light.light_traits import Traits
 from mitsplat.renderer.materials.radiance_grid import RadianceGrid
 from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
-from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes, is_transmissive
+from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes, is_null, is_transmissive
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 from mitsplat.renderer.occluders.splat_occlusion import Caster
 from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, merge_clouds, upload_cloud
+
+_REMEDIES = {
+    "Instance": "'instance' are not supported: add the shape at each place",
+    "Ellipsoids": "'ellipsoids' are not supported: load the file with a shape of type 'splats'",
+    "EllipsoidsMesh": "'ellipsoidsmesh' are not supported: load the file with a shape of type 'splats'",
+}
+"""Unsupported types of shapes by class name, with what to do instead."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +75,9 @@ class ContentsReader:
         if known is not None and known.state.holds_for(shapes):
             return known
         carriers = [s for s in shapes if hasattr(s, "world_from_splats")]
-        visible = [s for s in shapes if not hasattr(s, "world_from_splats")]
-        if any(s.class_name() == "Instance" for s in visible):
-            raise InputError(
-                "integrator 'splat_proxy': shapes of type 'instance' are not supported: add the shape at each place"
-            )
+        visible = [s for s in shapes if not hasattr(s, "world_from_splats") and not is_null(s.bsdf())]
+        for shape in shapes:
+            _refuse_unsupported(shape)
         distinct = list({id(c.splats): c.splats for c in carriers}.values())
         number = {id(splats): i for i, splats in enumerate(distinct)}
         placements = tuple(
@@ -118,6 +123,22 @@ class ContentsReader:
         ]
         clouds = [cloud for _, cloud in self._uploaded]
         return merge_clouds(clouds) if sum(c.count for c in clouds) else None
+
+
+def _refuse_unsupported(shape: mi.Shape) -> None:
+    """Raise an error for shapes that would be rendered wrongly.
+
+    Raises:
+        InputError: If the shape is an instance, Mitsuba's own splats, or the border of a medium.
+    """
+    remedy = _REMEDIES.get(shape.class_name())
+    if remedy is not None:
+        raise InputError(f"integrator 'splat_proxy': shapes of type {remedy}")
+    if shape.is_medium_transition():
+        raise InputError(
+            f"integrator 'splat_proxy': participating media are not supported: remove 'interior' and 'exterior' of the "
+            f"shape {shape.id()!r}"
+        )
 
 
 def _occluder(shape: mi.Shape) -> Occluder:

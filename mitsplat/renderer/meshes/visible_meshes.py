@@ -37,6 +37,11 @@ def is_diffuse(bsdf: mi.BSDF) -> bool:
     return (flags & int(mi.BSDFFlags.All)) == diffuse and not any(name in str(bsdf) for name in _NORMAL_MODIFIERS)
 
 
+def is_null(bsdf: mi.BSDF) -> bool:
+    """Return True if a material changes no light; a surface of it is invisible."""
+    return (int(bsdf.flags()) & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
+
+
 def is_transmissive(bsdf: mi.BSDF) -> bool:
     """Return True if light passes through a material, which then casts no shadow on splats and diffuse meshes."""
     return bool(has_bsdf_flag(int(bsdf.flags()), "GlossyTransmission", "DeltaTransmission")) or "ThinDielectric" in str(

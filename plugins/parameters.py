@@ -63,7 +63,7 @@ class Parameters:
 
     def integer(self, name: str, default: int, least: int, most: int) -> int:
         """Return an integer from ``least`` to ``most``."""
-        value = self._typed(name, default, (int,), f"from {least} to {most}")
+        value = self._typed(name, default, (int,), f"an integer from {least} to {most}")
         if not least <= value <= most:
             self.refuse(name, f"be from {least} to {most}", value)
         return int(value)

@@ -46,7 +46,7 @@ def test_given_parameters_are_read() -> None:
         (True, "number", (0.0,), "'x' must be a number (got True)"),
         (0, "positive", (1.0,), "'x' must be > 0 (got 0.0)"),
         (float("nan"), "positive", (1.0,), "'x' must be > 0 (got nan)"),
-        (1.0, "integer", (0, 0, 9), "'x' must be from 0 to 9 (got 1.0)"),
+        (1.0, "integer", (0, 0, 9), "'x' must be an integer from 0 to 9 (got 1.0)"),
         (10, "integer", (0, 0, 9), "'x' must be from 0 to 9 (got 10)"),
         (1, "boolean", (True,), "'x' must be true or false (got 1)"),
         (1, "string", ("",), "'x' must be text (got 1)"),

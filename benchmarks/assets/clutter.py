@@ -35,7 +35,8 @@ from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.fit.fit_settings import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.rigid import OPENCV_FROM_OPENGL
-from mitsplat.reconstruct.asset_evaluation import iou, show_asset
+from mitsplat.images.masks import iou
+from mitsplat.reconstruct.asset_evaluation import show_asset
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
 from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
 from mitsplat.runtime.variant import ensure_variant

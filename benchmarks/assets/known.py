@@ -35,7 +35,7 @@ from mitsplat.dataset.write import write_dataset
 from mitsplat.fit.fit_settings import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_distance import DistanceSurface
-from mitsplat.reconstruct.asset_evaluation import iou
+from mitsplat.images.masks import iou
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
 from mitsplat.reconstruct.reconstruct import AssetJob
 from mitsplat.runtime.variant import ensure_variant

@@ -51,7 +51,7 @@ from mitsplat.fit.trainer import fit_capture
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.mesh_distance import DistanceSurface
-from mitsplat.reconstruct.asset_evaluation import iou
+from mitsplat.images.masks import iou
 from mitsplat.reconstruct.materials.capture_light import CaptureLight
 from mitsplat.reconstruct.materials.estimation import estimate_materials
 from mitsplat.reconstruct.pose_refinement import refine_pose

@@ -22,7 +22,7 @@ from benchmarks.record import figure, recording
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
-from mitsplat.reconstruct.asset_evaluation import iou
+from mitsplat.images.masks import iou
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, refine_mesh
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface

@@ -38,7 +38,8 @@ from mitsplat.errors import InputError
 from mitsplat.fit.fit_settings import FitSettings
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.camera_poses import spiral
-from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, iou, show_asset
+from mitsplat.images.masks import iou
+from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE, show_asset
 from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos
 from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings

@@ -67,11 +67,16 @@ class Silhouette:
 
     def image_mask(self, width: int, height: int) -> BoolArray:
         """Return the mask in an image, shape (height, width)."""
-        canvas = np.zeros((height, width), dtype=bool)
-        if part := self.clipped(width, height):
-            x0, y0, x1, y1 = part.box
-            canvas[y0:y1, x0:x1] = part.mask
-        return canvas
+        part = self.clipped(width, height)
+        return np.zeros((height, width), dtype=bool) if part is None else part.within((0, 0, width, height))
+
+    def within(self, window: Box) -> BoolArray:
+        """Return the mask in a window that contains it, shape (y1 - y0, x1 - x0)."""
+        left, top, right, bottom = window
+        x0, y0, x1, y1 = self.box
+        mask = np.zeros((bottom - top, right - left), dtype=bool)
+        mask[y0 - top : y1 - top, x0 - left : x1 - left] = self.mask
+        return mask
 
 
 def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
@@ -96,6 +101,12 @@ def encode_mask(mask: BoolArray, box: Box, size: tuple[int, int]) -> str:
         counts = counts[:-1]
     code = coco_mask.frPyObjects({"size": [height, width], "counts": counts.tolist()}, height, width)
     return str(code["counts"].decode("ascii"))
+
+
+def iou(one: BoolArray, other: BoolArray) -> float:
+    """Return the intersection over union of two masks (H, W); 1 if both are empty."""
+    union = int(np.count_nonzero(one | other))
+    return int(np.count_nonzero(one & other)) / union if union else 1.0
 
 
 def boundary_f1(one: BoolArray, other: BoolArray) -> float:

@@ -27,12 +27,13 @@ from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.decomposition import convex_pieces
 from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.gltf_splats.splat_reading import is_gltf, read_gltf_splats
+from mitsplat.images.masks import iou
 from mitsplat.importing.cleaning import OUTLIERS, Cleaner
 from mitsplat.importing.import_result import Imported, ImportSupport
 from mitsplat.importing.standing import cut_base, topples
 from mitsplat.importing.upright import Plane, Upright, cut_support, find_up
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.asset_evaluation import iou, is_closed, show_asset
+from mitsplat.reconstruct.asset_evaluation import is_closed, show_asset
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 from mitsplat.renderer.layers import render_splats

@@ -37,6 +37,7 @@ from mitsplat.images.masks import (
     bounds_of_ids,
     decode_rle,
     encode_mask,
+    iou,
     without_fragments,
 )
 from mitsplat.labels.polygons import fill_polygon, outline
@@ -151,8 +152,7 @@ class InstanceLabel:
     def polygon_iou(self) -> float:
         """Intersection over union of the mask and the polygon rasterised by :func:`fill_polygon`."""
         height, width = self.mask.shape
-        filled = fill_polygon(self.polygon - self.box[:2], width, height)
-        return float(np.count_nonzero(filled & self.mask) / np.count_nonzero(filled | self.mask))
+        return iou(fill_polygon(self.polygon - self.box[:2], width, height), self.mask)
 
 
 @checks_arguments
@@ -345,12 +345,9 @@ def _amodal(
     parts = [visible] if silhouette is None else [silhouette, visible]
     x0, y0 = min(part.box[0] for part in parts), min(part.box[1] for part in parts)
     x1, y1 = max(part.box[2] for part in parts), max(part.box[3] for part in parts)
-    canvas = np.zeros((y1 - y0, x1 - x0), dtype=bool)
-    for part in parts:
-        left, top, right, bottom = part.box
-        canvas[top - y0 : bottom - y0, left - x0 : right - x0] |= part.mask
+    joint = np.logical_or.reduce([part.within((x0, y0, x1, y1)) for part in parts])
     # Fragments are removed inside the image like those of the visible mask, and separately in the full silhouette.
-    full = Silhouette.cropped(without_fragments(canvas, min_fragment)[0], x0, y0)
+    full = Silhouette.cropped(without_fragments(joint, min_fragment)[0], x0, y0)
     if min(full.box[:2]) >= 0 and full.box[2] <= size[0] and full.box[3] <= size[1]:
         return full, full.box, full.area
     inside = full.clipped(*size)
@@ -372,10 +369,8 @@ def _agreement(
     margin = 1 + BOUNDARY_TOLERANCE
     x0, y0, x1, y1 = max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)
     other = second[y0:y1, x0:x1] == number
-    one = np.zeros_like(other)
-    left, top, right, bottom = visible.box
-    one[top - y0 : bottom - y0, left - x0 : right - x0] = visible.mask
-    return float(np.count_nonzero(one & other) / np.count_nonzero(one | other)), boundary_f1(one, other)
+    one = visible.within((x0, y0, x1, y1))
+    return iou(one, other), boundary_f1(one, other)
 
 
 def _project_keypoints(

@@ -18,6 +18,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
+from mitsplat.images.masks import iou
 from mitsplat.quality import resolve_quality
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import Isolation
@@ -279,12 +280,6 @@ def is_closed(mesh: trimesh.Trimesh) -> bool:
     welded = mesh.copy()
     welded.merge_vertices(merge_tex=True, merge_norm=True)
     return bool(welded.is_watertight)
-
-
-def iou(one: BoolArray, other: BoolArray) -> float:
-    """Return the intersection over union of two masks (H, W); 1 if both are empty."""
-    union = int((one | other).sum())
-    return int((one & other).sum()) / union if union else 1.0
 
 
 def take_evenly(items: Sequence[T], count: int) -> list[T]:

@@ -18,8 +18,9 @@ import trimesh
 from mitsplat.asset import opaque_core
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.images.masks import iou
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.asset_evaluation import iou, is_closed, show_asset, take_evenly
+from mitsplat.reconstruct.asset_evaluation import is_closed, show_asset, take_evenly
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface

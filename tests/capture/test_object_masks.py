@@ -18,7 +18,7 @@ from mitsplat.capture.pipeline.capture_pipeline import _reject_occluded
 from mitsplat.capture.pipeline.capture_result import CaptureResult
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
-from mitsplat.reconstruct.asset_evaluation import iou
+from mitsplat.images.masks import iou
 from tests import rendered
 
 

@@ -15,7 +15,7 @@ from benchmarks.assets.known import chamfer
 from benchmarks.assets.refine_mesh import masked
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
-from mitsplat.reconstruct.asset_evaluation import iou
+from mitsplat.images.masks import iou
 from mitsplat.reconstruct.asset_report import write_asset_report
 from mitsplat.reconstruct.fold_repair import edges_through_faces, limit_motion
 from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, reconstruct_asset

@@ -32,6 +32,7 @@ from mitsplat.frames.frame import Renderer
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
+from mitsplat.images.masks import iou
 from mitsplat.progress import Note, Progress
 from mitsplat.quality import PRESETS, Quality
 from mitsplat.renderer.layers import Layers, render_splats
@@ -386,10 +387,10 @@ def _inside_objects(instances: npt.NDArray[np.uint16]) -> BoolArray:
 
 def _mask_iou(instances: npt.NDArray[np.uint16], true_instances: npt.NDArray[np.uint16]) -> float:
     """Compute the mean IoU over the instances of all pictures, or NaN."""
-    ious = []
-    for ids, true_ids in zip(instances, true_instances, strict=True):
-        present, counts = np.unique(true_ids[true_ids > 0], return_counts=True)
-        for instance in present[counts >= INSTANCE_MIN]:
-            mask, true_mask = ids == instance, true_ids == instance
-            ious.append(np.count_nonzero(mask & true_mask) / np.count_nonzero(mask | true_mask))
+    ious = [
+        iou(ids == instance, true_ids == instance)
+        for ids, true_ids in zip(instances, true_instances, strict=True)
+        for instance, count in zip(*np.unique(true_ids[true_ids > 0], return_counts=True), strict=True)
+        if count >= INSTANCE_MIN
+    ]
     return float(np.mean(ious)) if ious else math.nan

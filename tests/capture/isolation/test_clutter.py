@@ -20,7 +20,7 @@ from benchmarks.assets.photographing import Sensors, by_name, photograph, show_w
 from mitsplat.capture.capture import Capture, Photo
 from mitsplat.capture.geometric_masks import object_masks
 from mitsplat.capture.pipeline.picking import chosen_object
-from mitsplat.reconstruct.asset_evaluation import iou
+from mitsplat.images.masks import iou
 from mitsplat.runtime.variant import ensure_variant
 
 pytestmark = pytest.mark.slow

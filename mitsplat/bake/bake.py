@@ -31,7 +31,7 @@ from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.bake.verification import BakedView, MeshPictures, compare_views, compare_with_textures
 from mitsplat.errors import InputError
 from mitsplat.fit.refine_splats import Picture, refine_splats
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import rgb_to_sh
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import Surfels
@@ -279,7 +279,7 @@ def _surfel_splats(
     """
     if emitters is None:
         colours, materials = surface.sample_surfels(surfels, rng)
-        splats = surfels.splats((colours[:, None] - 0.5) / SH_C0)
+        splats = surfels.splats(rgb_to_sh(colours[:, None]))
         return splats, materials, MeshPictures(surface.picture, *_BASE_COLOUR_SAMPLES)
     scene = mitsuba_scene(parts, emitters)
     splats = bake_radiance(scene, surfels, rng, stages.step)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.fit.image_metrics import psnr_of
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import sh_to_rgb
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb, encode_srgb
@@ -109,7 +109,7 @@ def compare_with_textures(
         The ratio of all parts, or None without textures; and the ratio of each visible part that differs, by its name.
     """
     tree, outward = KDTree(splats.means), Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
-    reach, shown = _MAX_SIGMAS * splats.scales.max(axis=1), decode_srgb(0.5 + SH_C0 * splats.sh[:, 0])
+    reach, shown = _MAX_SIGMAS * splats.scales.max(axis=1), decode_srgb(sh_to_rgb(splats.sh[:, 0]))
     sums, different = np.zeros(2), {}
     for number, part in enumerate(parts):
         if part.texture is None or not part.mesh.area > 0:

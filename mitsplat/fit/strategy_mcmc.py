@@ -20,7 +20,7 @@ from scipy.special import comb
 
 from mitsplat.arrays import AnyArray, Float64Array
 from mitsplat.fit.optimizer import GaussianModel
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import rgb_to_sh
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.projection.gaussian import rotation_axes
@@ -117,7 +117,7 @@ def seed_splats(points: Float64Array, colours: Float64Array, sh_degree: int) -> 
     near = distance[:, 1:].mean(axis=1)
     near = np.clip(near, 0.05 * np.median(near) + 1e-9, 20 * np.median(near) + 1e-9)
     sh = np.zeros((len(points), (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (colours - 0.5) / SH_C0
+    sh[:, 0] = rgb_to_sh(colours)
     return Splats(
         means=points.astype(np.float32),
         quats=np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (len(points), 1)),

@@ -13,7 +13,7 @@ import numpy as np
 
 from mitsplat.arrays import AnyArray, Float64Array
 from mitsplat.errors import InputError
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import rgb_to_sh
 from mitsplat.gaussians.splat_arrays import SplatArrays
 
 _HEADER, _SECTION_HEADER = 4096, 1024
@@ -97,7 +97,7 @@ def _read_section(
     if level == 2:
         sh = sh_range[0] + sh / 255 * (sh_range[1] - sh_range[0])
     colours = rows["colour"] / 255.0
-    constant = (colours[:, None, :3] - 0.5) / SH_C0
+    constant = rgb_to_sh(colours[:, None, :3])
     arrays = SplatArrays(
         means=means.astype(np.float32),
         quats=rows["rotation"].astype(np.float32),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.arrays import AnyArray, Float32Array, Float64Array
 from mitsplat.images.colour import encode_srgb
 
 SH_C0 = 0.28209479177387814
@@ -21,6 +21,16 @@ _SH_C3 = (
     1.445305721320277,
     -0.5900435899266435,
 )
+
+
+def rgb_to_sh(colours: AnyArray) -> AnyArray:
+    """Return the constant coefficients (..., 3) of display-encoded colours (..., 3)."""
+    return (colours - 0.5) / SH_C0
+
+
+def sh_to_rgb(constant: AnyArray) -> AnyArray:
+    """Return the display-encoded colours (..., 3) of constant coefficients (..., 3), without view dependence."""
+    return 0.5 + SH_C0 * constant
 
 
 def sh_basis(directions: npt.ArrayLike, degree: int) -> Float64Array:
@@ -109,9 +119,8 @@ def encode_sh(sh: Float32Array) -> Float32Array:
 
     The constant band is exact. The others are multiplied by the slope of the encoding at the mean colour.
     """
-    mean, step = np.maximum(0.5 + SH_C0 * sh[:, :1].astype(np.float64), 0.0), 1e-4
+    mean, step = np.maximum(sh_to_rgb(sh[:, :1].astype(np.float64)), 0.0), 1e-4
     slope = (encode_srgb(mean + step) - encode_srgb(np.maximum(mean - step, 0))) / (
         mean + step - np.maximum(mean - step, 0)
     )
-    constant = (encode_srgb(mean) - 0.5) / SH_C0
-    return np.concatenate([constant, slope * sh[:, 1:]], axis=1).astype(np.float32)
+    return np.concatenate([rgb_to_sh(encode_srgb(mean)), slope * sh[:, 1:]], axis=1).astype(np.float32)

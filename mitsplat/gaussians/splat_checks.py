@@ -8,7 +8,7 @@ import numpy as np
 
 from mitsplat.arrays import Float32Array
 from mitsplat.errors import InputError
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import sh_to_rgb
 
 _MIN_JUDGED = 100
 """Number of Gaussians from which their values show how they are encoded."""
@@ -136,5 +136,5 @@ def colours_differ(colours: Float32Array, coefficients: Float32Array) -> bool:
     if not len(colours):
         return False
     scale = 1.0 if colours.max() > 1 else 255.0
-    expected = 255 * np.clip(0.5 + SH_C0 * coefficients.astype(np.float64), 0, 1)
+    expected = 255 * np.clip(sh_to_rgb(coefficients.astype(np.float64)), 0, 1)
     return bool(np.median(np.abs(scale * colours - expected).max(axis=1)) > _EQUAL_COLOURS)

@@ -27,7 +27,7 @@ from mitsplat.arguments import checks_arguments, describe, path_of, real_array
 from mitsplat.arrays import AnyArray, BoolArray, Float32Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import read_materials
-from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_rotation
+from mitsplat.gaussians.spherical_harmonics import rgb_to_sh, sh_rotation, sh_to_rgb
 from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_files import read_splats, write_splats
 from mitsplat.gaussians.splat_materials import MAX_SPECULAR, SplatMaterials
@@ -195,7 +195,7 @@ class Splats:
         materials = SplatMaterials.uniform(len(self), metallic=metallic, roughness=roughness, specular=specular)
         sh, mirrored = self.sh[:, :1], (1 - metallic) * MAX_SPECULAR * specular
         if mirrored > 0:
-            sh = ((encode_srgb(decode_srgb(0.5 + SH_C0 * sh) - mirrored) - 0.5) / SH_C0).astype(np.float32)
+            sh = rgb_to_sh(encode_srgb(decode_srgb(sh_to_rgb(sh)) - mirrored)).astype(np.float32)
         return replace(self, sh=sh, materials=materials)
 
     @staticmethod

@@ -32,7 +32,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.ksplat_files import decode_ksplat
 from mitsplat.gaussians.ply_files import MAX_PLY_HEADER, decode_ply, encode_ply, examine_columns
 from mitsplat.gaussians.sog_files import decode_sog
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import rgb_to_sh, sh_to_rgb
 from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_checks import check_precision
 from mitsplat.gaussians.spz_files import decode_spz, encode_spz
@@ -161,13 +161,13 @@ def _decode_splat(data: bytes) -> SplatArrays:
         quats=rows["quat"][:, [1, 2, 3, 0]].astype(np.float32) - 128.0,  # normalised by Splats
         scales=rows["scale"],
         opacities=rgba[:, 3],
-        sh=(rgba[:, None, :3] - 0.5) / SH_C0,
+        sh=rgb_to_sh(rgba[:, None, :3]),
     )
 
 
 def _encode_splat(splats: SplatArrays, _kernel: KernelName | None) -> bytes:
     rows = np.empty(len(splats.means), _SPLAT_ROW)
-    rgba = np.column_stack([0.5 + SH_C0 * splats.sh[:, 0], splats.opacities])
+    rgba = np.column_stack([sh_to_rgb(splats.sh[:, 0]), splats.opacities])
     rows["mean"], rows["scale"] = splats.means, splats.scales
     rows["rgba"] = np.rint(255.0 * np.clip(rgba, 0.0, 1.0))
     rows["quat"] = np.clip(np.rint(128.0 * splats.quats[:, [3, 0, 1, 2]] + 128.0), 0.0, 255.0)

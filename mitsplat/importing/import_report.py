@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsplat.errors import InputError
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import rgb_to_sh
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh import mass_properties
 from mitsplat.importing.import_result import Imported
@@ -81,8 +81,7 @@ def _removed(imported: Imported) -> str:
     removed_splats = imported.removed_splats
     if not len(removed_splats) or not imported.views:
         return ""
-    red = np.zeros((len(removed_splats), 1, 3), dtype=np.float32)
-    red[:, 0] = np.array([0.4, -0.4, -0.4]) / SH_C0
+    red = np.tile(rgb_to_sh(np.array([0.9, 0.1, 0.1])).astype(np.float32), (len(removed_splats), 1, 1))
     everything = Splats.concatenate([imported.asset.splats, replace(removed_splats, sh=red)])
     cameras = [view.camera for view in imported.views[:_REMOVED_VIEWS]]
     images = "".join(

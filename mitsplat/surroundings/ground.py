@@ -11,7 +11,7 @@ from scipy.ndimage import binary_closing, binary_fill_holes, distance_transform_
 
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from mitsplat.capture.capture import Capture
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import rgb_to_sh
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
@@ -153,7 +153,7 @@ class Grid:
                 (count, 1),
             ),
             opacities=np.full(count, 0.95, dtype=np.float32),
-            sh=((texture[cells] - 0.5) / SH_C0)[:, None].astype(np.float32),
+            sh=rgb_to_sh(texture[cells])[:, None].astype(np.float32),
         )
 
 

@@ -18,7 +18,7 @@ import trimesh
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import sh_to_rgb
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.camera_poses import look_at_pose
@@ -180,7 +180,7 @@ def look_same(one: Any, other: Any) -> bool:
 
 def base_colours(splats: Splats) -> Float32Array:
     """Return the direction-independent, display-encoded colours in [0, 1], shape (N, 3)."""
-    return np.asarray(np.clip(0.5 + SH_C0 * splats.sh[:, 0], 0.0, 1.0), dtype=np.float32)
+    return np.asarray(np.clip(sh_to_rgb(splats.sh[:, 0]), 0.0, 1.0), dtype=np.float32)
 
 
 def scene_parts(

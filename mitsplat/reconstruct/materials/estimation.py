@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.capture.capture import Capture
 from mitsplat.errors import InputError
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import rgb_to_sh
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.images.colour import encode_srgb
@@ -122,7 +122,7 @@ class MaterialEstimate:
         table = np.array([(region.metallic, region.roughness) for region in self.regions])
         metallic, roughness = table[self.region[nearest[:, 0]]].T.astype(np.float32)
         materials = SplatMaterials(metallic, roughness, np.full(len(splats), 0.5, dtype=np.float32))
-        return replace(splats, sh=((colours[:, None] - 0.5) / SH_C0).astype(np.float32), materials=materials)
+        return replace(splats, sh=rgb_to_sh(colours[:, None]).astype(np.float32), materials=materials)
 
 
 def estimate_materials(capture: Capture, mesh: trimesh.Trimesh, light: CaptureLight) -> MaterialEstimate:

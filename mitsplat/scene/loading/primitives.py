@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
-from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.spherical_harmonics import rgb_to_sh
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import Surfels, place_surfels
 
@@ -46,7 +46,7 @@ def _make(number: int, rng: np.random.Generator) -> Asset:
     is_metal = rng.random() < 0.3
     friction, roughness = float(rng.uniform(0.3, 0.7)), float(rng.uniform(0.1, 0.8))
     materials = SplatMaterials.uniform(len(surfels), metallic=float(is_metal), roughness=roughness, specular=0.5)
-    splats = surfels.splats((np.array(colours)[second.astype(int)][:, None] - 0.5) / SH_C0)
+    splats = surfels.splats(rgb_to_sh(np.array(colours)[second.astype(int)][:, None]))
     return Asset(
         name=f"{kind}_{number}",
         class_name=kind,

@@ -33,7 +33,7 @@ from mitsplat.arrays import Float32Array, Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.rigid import homogeneous_matrix, transform_points
+from mitsplat.geometry.rigid import homogeneous_matrix, scaling, transform_points
 from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.storage.field_types import Name, Positive
 from mitsplat.storage.file_kinds import no_folder_with
@@ -229,7 +229,7 @@ class Asset:
         """
         folder = path_of(folder, "folder")
         units = _SPZ_UNITS if splats.lower().endswith(".spz") and self.units == "metre" else 1.0
-        stored = self if units == 1.0 else self.transformed(np.diag([1 / units, 1 / units, 1 / units, 1.0]))
+        stored = self if units == 1.0 else self.transformed(scaling(1 / units))
         try:
             spec = AssetSpec(
                 format_version=FORMAT_VERSIONS[ASSET_FILE],
@@ -299,8 +299,8 @@ class Asset:
         """
         if not 0 < factor < np.inf:
             raise ValueError(f"scale factor must be finite and > 0 (got {factor})")
-        larger = self.transformed(np.diag([factor, factor, factor, 1.0]))
-        return larger if self.mass is None else replace(larger, mass=self.mass * factor**3)
+        scaled = self.transformed(scaling(factor))
+        return scaled if self.mass is None else replace(scaled, mass=self.mass * factor**3)
 
     def factor_to(self, size: float) -> float:
         """Compute the scale factor for a longest extent ``size`` [m].
@@ -327,8 +327,7 @@ class Asset:
         """
         if self.units == "metre":
             raise InputError(f"asset {self.name!r} is in metres: it takes a scale, not a size")
-        factor = self.factor_to(size)
-        return replace(self.transformed(np.diag([factor, factor, factor, 1.0])), units="metre")
+        return replace(self.transformed(scaling(self.factor_to(size))), units="metre")
 
     def check(self) -> tuple[str, ...]:
         """Return warnings about the asset, one sentence each; none of them prevents its use."""

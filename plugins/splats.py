@@ -13,7 +13,7 @@ from mitsplat.asset import ASSET_FILE, Asset, read_spec
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import specular_of
-from mitsplat.geometry.rigid import split_similarity
+from mitsplat.geometry.rigid import scaling, split_similarity
 from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.renderer.materials.proxy_materials import GlossChange
@@ -165,7 +165,7 @@ class SplatsShape(mi.Mesh):
         self.splats = splats
         self.proxy = proxy
         self.gloss = self._read_gloss(props, is_uniform)
-        self.world_from_splats = _matrix(props) @ np.diag([units, units, units, 1.0]) if units else _matrix(props)
+        self.world_from_splats = _matrix(props) @ scaling(units) if units else _matrix(props)
         self.appearance = self._read_appearance(given)
 
     def _load_uniform(self, given: Parameters, path: Path, modified: int) -> Splats:

@@ -31,7 +31,7 @@ from mitsplat.gaussians.spherical_harmonics import rgb_to_sh, sh_rotation, sh_to
 from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_files import read_splats, write_splats
 from mitsplat.gaussians.splat_materials import MAX_SPECULAR, SplatMaterials
-from mitsplat.geometry.rigid import split_similarity
+from mitsplat.geometry.rigid import scaling, split_similarity
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.quality import KernelName
 
@@ -143,7 +143,7 @@ class Splats:
             splats = replace(splats, materials=read_materials(Path(materials), len(splats)))
             if splats.sh_degree:
                 raise InputError(f"{path}: splats with materials must have SH degree 0 (got {splats.sh_degree})")
-        return splats if units == 1.0 else splats.transformed(np.diag([units, units, units, 1.0]))
+        return splats if units == 1.0 else splats.transformed(scaling(units))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write a 3DGS ``.ply`` (lossless to float32 rounding), a ``.splat`` or an ``.spz`` (both quantised).

@@ -95,6 +95,11 @@ def homogeneous_matrix(linear: npt.ArrayLike, translation: npt.ArrayLike = (0.0,
     return matrix
 
 
+def scaling(factor: float) -> Float64Array:
+    """Return the transform (4, 4) that scales uniformly about the origin."""
+    return np.diag([factor, factor, factor, 1.0])
+
+
 def nearest_rigid(matrix: Float64Array) -> Float64Array:
     """Return the rigid transform (4, 4) with the rotation that is nearest to the given one.
 

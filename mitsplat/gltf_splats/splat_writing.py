@@ -14,7 +14,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.spz_files import encode_spz
-from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
+from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP, scaling
 from mitsplat.gltf_splats.splat_reading import COMPRESSION, ENCODED, EXTENSION, GLTF_FROM_SPZ
 from mitsplat.storage.files import JsonObject, storage_errors, write_bytes
 from mitsplat.version import __version__
@@ -57,7 +57,7 @@ def write_gltf_splats(splats: Splats, path: Path, *, name: str, spz: bool = Fals
     if not len(splats):
         raise InputError(f"{path}: a glTF file must hold at least one Gaussian (got 0)")
     unit = _spz_unit(splats) if spz else 1.0
-    turned = splats.transformed(np.diag([1 / unit, 1 / unit, 1 / unit, 1.0]) @ Z_UP_FROM_Y_UP.T)
+    turned = splats.transformed(scaling(1 / unit) @ Z_UP_FROM_Y_UP.T)
     names, properties, extensions = _attributes(turned), {"kernel": "ellipse", "colorSpace": ENCODED}, [EXTENSION]
     accessors: list[JsonObject] = []
     views: list[JsonObject] = []

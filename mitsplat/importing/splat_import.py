@@ -25,7 +25,7 @@ from mitsplat.gaussians.splat_files import Axis, default_up_axis
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.decomposition import convex_pieces
-from mitsplat.geometry.rigid import homogeneous_matrix
+from mitsplat.geometry.rigid import homogeneous_matrix, scaling
 from mitsplat.gltf_splats.splat_reading import is_gltf, read_gltf_splats
 from mitsplat.images.masks import iou
 from mitsplat.importing.cleaning import OUTLIERS, Cleaner
@@ -284,8 +284,8 @@ def _in_metres(
         asset, asset_from_file = asset.transformed(base), base @ asset_from_file
     factor = settings.units if settings.size is None else asset.factor_to(settings.size)
     if factor is not None:
-        larger = np.diag([factor, factor, factor, 1.0])
-        asset, asset_from_file = replace(asset.transformed(larger), units="metre"), larger @ asset_from_file
+        metres = scaling(factor)
+        asset, asset_from_file = replace(asset.transformed(metres), units="metre"), metres @ asset_from_file
     return asset, asset_from_file, factor
 
 

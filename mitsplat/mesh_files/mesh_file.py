@@ -13,6 +13,7 @@ from PIL import Image
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.errors import InputError
+from mitsplat.geometry.rigid import scaling
 from mitsplat.images.colour import eight_bit, in_srgb
 from mitsplat.storage.files import IMAGE_ERRORS
 
@@ -178,7 +179,7 @@ class MeshFrame:
 
 def world_from_file(metres_per_unit: float, up: Axis) -> Float64Array:
     """Return the transform (4, 4) from the file's units and axes to metres, z up."""
-    matrix = np.diag([metres_per_unit, metres_per_unit, metres_per_unit, 1.0])
+    matrix = scaling(metres_per_unit)
     if up == "y":
         matrix = matrix @ trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0))
     elif up == "x":

@@ -19,6 +19,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.geometry.rigid import scaling
 from mitsplat.mesh_files.gltf import read_gltf
 from mitsplat.mesh_files.mesh_file import PAINTED_MATERIAL, FilePart, MeshFile
 from mitsplat.runtime.child_process import run_bounded
@@ -41,7 +42,7 @@ _SAME = 1e-6
 _EXTERNAL = re.compile(rb"DOCUMENT_FILE\s*\(\s*'([^']{0,80})")
 """Entity that names another file, which OpenCASCADE would read from anywhere."""
 _EMPTY = "its text is damaged, or it has no surfaces"
-_MM = np.diag([1000.0, 1000.0, 1000.0, 1.0])
+_MM = scaling(1000.0)
 
 
 def read_step(path: Path, *, tolerance: float | None = None, separate: bool = False) -> MeshFile:

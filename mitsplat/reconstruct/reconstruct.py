@@ -17,6 +17,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.decomposition import convex_pieces
+from mitsplat.geometry.rigid import scaling
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, compute_verdict, show_held_out
 from mitsplat.reconstruct.causes import find_causes
@@ -263,10 +264,10 @@ def _in_metres(asset: Asset, job: AssetJob, alignment: Alignment | None) -> tupl
     if size is not None:
         turn = _alignment_rotation(asset.mesh)
         asset = asset.transformed(turn)
-        return asset.resized(size), np.diag([*[asset.factor_to(size)] * 3, 1.0]) @ turn
+        return asset.resized(size), scaling(asset.factor_to(size)) @ turn
     if asset.units == "unknown" and alignment is not None and imported is not None and imported.metres_per_unit:
         metres = imported.metres_per_unit / alignment.scale
-        return replace(asset.scaled(metres), units="metre"), np.diag([metres, metres, metres, 1.0])
+        return replace(asset.scaled(metres), units="metre"), scaling(metres)
     return asset, np.eye(4)
 
 

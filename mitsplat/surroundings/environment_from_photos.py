@@ -18,7 +18,7 @@ from mitsplat.asset import Asset
 from mitsplat.capture.capture import Capture
 from mitsplat.fit.image_metrics import psnr
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.rigid import homogeneous_matrix
+from mitsplat.geometry.rigid import homogeneous_matrix, scaling
 from mitsplat.geometry.triangulation import nearest_point_to_lines, optical_axes
 from mitsplat.pages.html import make_section, rgb_image
 from mitsplat.progress import Progress
@@ -121,7 +121,7 @@ def reconstruct_environment(
     made = reconstruct_asset(
         place.capture, place.splats, replace(job, imported=imported, remove=()), psnr=psnr, progress=progress
     )
-    made, larger = _without_rotation(made, motion)
+    made, asset_from_place = _without_rotation(made, motion)
     rows = {
         "Frame": _frame_text(made.asset.units, place.capture.scale_error, source),
         "Removed Gaussians": ", ".join(f"{count} {reason}" for reason, count in removed.items()),
@@ -129,7 +129,7 @@ def reconstruct_environment(
     }
     findings, sections, record = list[str](), list[str](), dict[str, object]()
     if place.supports:
-        surfaces = _describe_surfaces(place, removed_objects, made.asset, larger)
+        surfaces = _describe_surfaces(place, removed_objects, made.asset, asset_from_place)
         rows |= surfaces.rows
         findings += surfaces.findings
         sections.append(surfaces.map)
@@ -168,7 +168,7 @@ class _Surfaces(NamedTuple):
 
 
 def _describe_surfaces(
-    place: _PhotographedPlace, removed: Sequence[RemovedObject], asset: Asset, larger: Float64Array
+    place: _PhotographedPlace, removed: Sequence[RemovedObject], asset: Asset, asset_from_place: Float64Array
 ) -> _Surfaces:
     """Measure how the photos cover the first surface, and describe all.
 
@@ -176,13 +176,13 @@ def _describe_surfaces(
         place: The place without removed objects, with at least one support.
         removed: Objects that were removed from surfaces.
         asset: The environment.
-        larger: Transform (4, 4) from the frame of the place to the asset's, without a rotation.
+        asset_from_place: Transform (4, 4) from the frame of the place to the asset's, without a rotation.
     """
-    factor, metric, first = float(larger[0, 0]), asset.units == "metre", place.supports[0]
+    factor, metric, first = float(asset_from_place[0, 0]), asset.units == "metre", place.supports[0]
     coverage = find_coverage(first, place.views, place.points, place.scale)
     named = [(photo.name, photo.camera) for photo in place.capture.training]
     holes = find_holes(first, coverage, place.splats, named)
-    supports = [support.transformed(larger) for support in place.supports]
+    supports = [support.transformed(asset_from_place) for support in place.supports]
     filled = coverage.cells_with(np.concatenate([np.zeros((0, 2)), *(t.filled for t in removed if t.support == 0)]))
     region = _region(coverage, factor)
     unit = "m" if metric else "units"
@@ -204,7 +204,7 @@ def _describe_surfaces(
         {"pose": s.pose.tolist(), "size": list(s.size), "tilt": s.tilt, "roughness": s.roughness} for s in supports
     ]
     if region is not None and metric:
-        seen = [photo.camera for photo in place.capture.transformed(larger).photos]
+        seen = [photo.camera for photo in place.capture.transformed(asset_from_place).photos]
         record["scene"] = scene_text(asset.name, supports, region, seen)
     findings = _findings(coverage, holes, region, factor, unit, metric=metric)
     return _Surfaces(rows, findings, _support_map(coverage, filled), record)
@@ -250,8 +250,9 @@ def _without_rotation(made: Reconstruction, motion: Float64Array) -> tuple[Recon
     """
     factor = float(np.cbrt(np.linalg.det(made.asset_from_capture[:3, :3])))
     back = homogeneous_matrix(made.asset_from_capture[:3, :3].T / factor)
-    larger = np.diag([factor, factor, factor, 1.0])
-    return replace(made, asset=made.asset.transformed(back), asset_from_capture=larger @ motion), larger
+    asset_from_place = scaling(factor)
+    made = replace(made, asset=made.asset.transformed(back), asset_from_capture=asset_from_place @ motion)
+    return made, asset_from_place
 
 
 def _typical_depth(capture: Capture) -> float:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.errors import InputError
-from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP
+from mitsplat.geometry.rigid import Z_UP_FROM_Y_UP, scaling
 from mitsplat.usd.stage_images import image_settings, unread_settings
 from mitsplat.usd.stage_meshes import triangles_of
 from mitsplat.usd.stage_motion import is_moving, lineage, sampled_attributes, time_codes, visibility
@@ -52,7 +52,7 @@ class StageReader:
         if not 0 < units < np.inf:
             raise InputError(f"metersPerUnit must be finite and > 0 (got {units:g})")
         up = Z_UP_FROM_Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else np.eye(4)
-        self._world_from_stage = np.diag([units, units, units, 1.0]) @ up
+        self._world_from_stage = scaling(units) @ up
         self._units, self._kilograms = units, UsdPhysics.GetStageKilogramsPerUnit(stage)
         self._cache = UsdGeom.XformCache(self._time)
         self._ignored: dict[str, list[str]] = defaultdict(list)

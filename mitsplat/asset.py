@@ -427,9 +427,5 @@ def _part_numbers(mesh: trimesh.Trimesh) -> Int64Array:
 
 def _concatenated(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Concatenate the triangles of all meshes, without colours, textures or vertex merging."""
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    return trimesh.Trimesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
-        process=False,
-    )
+    vertices, faces = trimesh.util.append_faces([mesh.vertices for mesh in meshes], [mesh.faces for mesh in meshes])
+    return trimesh.Trimesh(vertices, faces, process=False)

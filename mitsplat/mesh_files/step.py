@@ -157,11 +157,12 @@ def _read_parts(path: Path, glb: bytes) -> MeshFile:
 
 def _merge(primitives: list[FilePart]) -> FilePart:
     first = primitives[0]
-    offsets = np.cumsum([0, *(len(part.vertices) for part in primitives[:-1])])
+    arrays = [part.vertices for part in primitives], [part.faces for part in primitives]
+    vertices, faces = trimesh.util.append_faces(*arrays)
     return FilePart(
         first.name,
-        np.concatenate([part.vertices for part in primitives]),
-        np.concatenate([part.faces + offset for part, offset in zip(primitives, offsets, strict=True)]),
+        vertices,
+        faces,
         _MM @ first.transform,
         PAINTED_MATERIAL,
         np.concatenate([_colours(part) for part in primitives]),

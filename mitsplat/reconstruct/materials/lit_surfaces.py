@@ -35,11 +35,8 @@ def lit_surfaces(mesh: trimesh.Trimesh, views: Sequence[View], light: CaptureLig
     """Return the object with its radiance in the photos, and its support, a plane at height ``floor``."""
     fine = trimesh.Trimesh(mesh.vertices, mesh.faces).subdivide_to_size(float(mesh.scale) / 25, max_iter=20)
     plane = _plane(mesh, floor)
-    whole = trimesh.Trimesh(
-        np.concatenate([fine.vertices, plane.vertices]),
-        np.concatenate([fine.faces, plane.faces + len(fine.vertices)]),
-        process=False,
-    )
+    arrays = trimesh.util.append_faces([fine.vertices, plane.vertices], [fine.faces, plane.faces])
+    whole = trimesh.Trimesh(*arrays, process=False)
     surfaces = LitMesh(whole, len(fine.faces), light.scene(), mesh.bounds.mean(axis=0).tolist())
     photographed = observe(surfaces, fine.vertices, np.asarray(fine.vertex_normals), views, "object")
     radiance = np.zeros((len(whole.vertices), 4, 3))

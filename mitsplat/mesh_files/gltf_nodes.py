@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.mesh_files.gltf_data import GltfData
 from mitsplat.storage.files import JsonObject
 
@@ -57,8 +58,6 @@ def _local_pose(node: JsonObject) -> Float64Array:
                 "stored row by row?"
             )
         return matrix
-    pose = np.eye(4)
     turn = Rotation.from_quat(np.asarray(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)).as_matrix()
-    pose[:3, :3] = turn * np.asarray(node.get("scale", (1, 1, 1)), dtype=np.float64)
-    pose[:3, 3] = node.get("translation", (0, 0, 0))
-    return pose
+    linear = turn * np.asarray(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    return homogeneous_matrix(linear, node.get("translation", (0, 0, 0)))

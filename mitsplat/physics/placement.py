@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.geometry.mesh_distance import ROUNDING_ERROR, DistanceSurface, PlacedSurface, clearance
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import PILE_HEIGHT
@@ -166,10 +167,7 @@ class _Draw:
         if arrangement == "tipped":
             return self._gather(free)
         place: dict[str, Callable[[int], bool]] = {
-            "drop": self._drop,
-            "tossed": self._drop,
-            "pushed": self._drop,
-            "shaken": self._drop,
+            **dict.fromkeys(("drop", "tossed", "pushed", "shaken"), self._drop),
             "pile": self._pour,
             "scatter": self._scatter,
             "upright": lambda i: self._stand(i, self._draw_side(i), self._yaw),
@@ -231,8 +229,7 @@ class _Draw:
         occupies: Callable[[Float64Array], Float64Array] | None = None,
     ) -> bool:
         """Place an item with a random rotation at a free position between two corners."""
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.random(rng=self._rng).as_matrix()
+        pose = homogeneous_matrix(Rotation.random(rng=self._rng).as_matrix())
         bounds = _bounds(self._items[i].outline, pose)
         if (low - bounds[0] > high - bounds[1]).any():
             return False
@@ -271,8 +268,7 @@ class _Draw:
         if members and not self._stand(members[0], sides[members[0]], self._yaw):
             return False
         for i in members[1:]:
-            below, pose = self._occupied[-1], np.eye(4)
-            pose[:3, :3] = self._draw_yaw(self._yaw) @ sides[i]
+            below, pose = self._occupied[-1], homogeneous_matrix(self._draw_yaw(self._yaw) @ sides[i])
             bounds = _bounds(self._items[i].outline, pose)
             pose[:2, 3] = (below - bounds).mean(axis=0)[:2] + self._rng.uniform(
                 -_MAX_TOWER_OFFSET, _MAX_TOWER_OFFSET, 2
@@ -288,12 +284,12 @@ class _Draw:
         """Place all members side by side in rows along x, starting at the region's low corner."""
         corner, depth = self._low.copy(), 0.0
         for i in self._rng.permutation(np.asarray(members, dtype=np.intp)).tolist():
-            pose = np.eye(4)
             if self._yaw is not None:
                 angle = self._rng.uniform(*self._yaw)
             else:
                 angle = 90 * int(self._rng.integers(4)) + self._rng.uniform(-_MAX_PACK_YAW, _MAX_PACK_YAW)
-            pose[:3, :3] = Rotation.from_euler("z", angle, degrees=True).as_matrix() @ self._draw_side(i)
+            turn = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+            pose = homogeneous_matrix(turn @ self._draw_side(i))
             bounds = _bounds(self._items[i].outline, pose)
             size, room = bounds[1] - bounds[0], self._rng.uniform(*_PACK_GAP)
             if corner[0] + size[0] > self._high[0]:
@@ -315,8 +311,7 @@ class _Draw:
         """Put an item, rotated about the vertical, down on the surface below."""
         outline = self._items[i].outline
         for _ in range(_MAX_POSITIONS):
-            pose = np.eye(4)
-            pose[:3, :3] = self._draw_yaw(yaw) @ turn
+            pose = homogeneous_matrix(self._draw_yaw(yaw) @ turn)
             bounds = _bounds(outline, pose)
             low, high = self._low - bounds[0], self._high - bounds[1]
             if (low > high).any():

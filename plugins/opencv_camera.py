@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -36,7 +38,8 @@ class OpenCVCamera(mi.Sensor):
 
      * - to_world
        - |transform|
-       - Pose in Mitsuba's camera axes (x left, y up, z forward), as ``lookat`` gives it. (Default: none)
+       - Pose in Mitsuba's camera axes (x left, y up, z forward), as ``lookat`` gives it; ``mi.traverse`` can change it.
+         (Default: none)
 
      * - aperture_radius
        - |float|
@@ -56,11 +59,8 @@ class OpenCVCamera(mi.Sensor):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.world_from_mitsuba = np.array(
-            props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64
-        ).reshape(4, 4)
-        if np.abs(self.world_from_mitsuba[:3, :3].T @ self.world_from_mitsuba[:3, :3] - np.eye(3)).max() > 1e-4:
-            raise InputError("sensor 'opencv_camera': 'to_world' must be a rotation and a translation")
+        self.to_world: mi.AffineTransform4f | None = None
+        self._place(props.get("to_world", mi.ScalarTransform4f()))
         given = Parameters(props, "sensor 'opencv_camera'")
         width, height = self.film().size()
         self.fx, self.fy = given.positive("fx", None), given.positive("fy", None)
@@ -82,6 +82,26 @@ class OpenCVCamera(mi.Sensor):
             )
         except ValueError as error:
             raise InputError(f"sensor 'opencv_camera': {error}") from None
+
+    def _place(self, to_world: mi.AffineTransform4f) -> None:
+        """Set the pose."""
+        pose = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4)
+        if np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() > 1e-4:
+            raise InputError("sensor 'opencv_camera': 'to_world' must be a rotation and a translation")
+        self.world_from_mitsuba = pose
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Offer ``to_world`` to ``mi.traverse``, besides the parameters of all sensors."""
+        super().traverse(callback)
+        if self.to_world is None:
+            self.to_world = mi.AffineTransform4f(mi.Matrix4f(self.world_from_mitsuba.tolist()))
+        callback.put("to_world", self.to_world, mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Move the camera to a changed ``to_world``."""
+        super().parameters_changed(list(keys))
+        if self.to_world is not None:
+            self._place(self.to_world)
 
     def view(self, samples: int = 1) -> CameraView:
         """Return the camera of the splat renderer."""

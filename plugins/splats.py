@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -57,7 +58,7 @@ class SplatsShape(mi.Mesh):
 
      * - to_world
        - |transform|
-       - Rigid transform with uniform scale. (Default: none)
+       - Rigid transform with uniform scale; ``mi.traverse`` can change it. (Default: none)
 
      * - instance
        - |int|
@@ -112,6 +113,7 @@ class SplatsShape(mi.Mesh):
         self, props: mi.Properties, splats: Splats | None = None, proxy: trimesh.Trimesh | None = None
     ) -> None:
         super().__init__("splats", 3, 1, props=props)
+        self.to_world: mi.AffineTransform4f | None = None
         if self.is_emitter():
             raise InputError("shape 'splats': must not have an emitter: add it to a mesh")
         for name, _ in props.objects():
@@ -165,8 +167,35 @@ class SplatsShape(mi.Mesh):
         self.splats = splats
         self.proxy = proxy
         self.gloss = self._read_gloss(props, is_uniform)
-        self.world_from_splats = _matrix(props) @ scaling(units) if units else _matrix(props)
+        self._metres = scaling(units or 1.0)
+        pose = np.array(props["to_world"].matrix, np.float64).reshape(4, 4) if "to_world" in props else np.eye(4)
+        self.world_from_splats = self._placed(pose)
         self.appearance = self._read_appearance(given)
+
+    def _placed(self, pose: np.ndarray) -> np.ndarray:
+        """Return the transform of the splats for a value of ``to_world``."""
+        try:
+            split_similarity(pose)
+        except InputError as error:
+            raise InputError(f"shape 'splats': 'to_world': {error}") from None
+        self._pose = pose
+        return pose @ self._metres
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Offer ``to_world`` to ``mi.traverse`` instead of the parameters of the hidden mesh."""
+        if not hasattr(self, "_pose"):  # in the constructor
+            super().traverse(callback)
+            return
+        if self.to_world is None:
+            self.to_world = mi.AffineTransform4f(mi.Matrix4f(self._pose.tolist()))
+        callback.put("to_world", self.to_world, mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Move splats and proxy to a changed ``to_world``."""
+        if self.to_world is None:
+            super().parameters_changed(list(keys))
+        else:
+            self.world_from_splats = self._placed(np.array(self.to_world.matrix, np.float64).reshape(4, 4))
 
     def _load_uniform(self, given: Parameters, path: Path, modified: int) -> Splats:
         """Load splats of one material: the parameter ``metallic``, with the shape's roughness and specular."""
@@ -203,17 +232,6 @@ class SplatsShape(mi.Mesh):
     def to_string(self) -> str:
         """Return the description that Mitsuba prints."""
         return f"SplatsShape[count = {len(self.splats)}, instance = {self.instance}, proxy = {self.proxy is not None}]"
-
-
-def _matrix(props: mi.Properties) -> np.ndarray:
-    if "to_world" not in props:
-        return np.eye(4)
-    matrix = np.array(props["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-    try:
-        split_similarity(matrix)
-    except InputError as error:
-        raise InputError(f"shape 'splats': 'to_world': {error}") from None
-    return matrix
 
 
 def _stamp(filename: str, inside: str = "") -> tuple[Path, int]:

@@ -9,8 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import trimesh
 
 from mitsplat.errors import InputError
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.layers import make_integrator, make_splats_shape
 from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_light import WHITE_SKY, floor, nothing, slab
@@ -86,6 +88,89 @@ def test_a_changed_parameter_changes_the_image_as_in_a_new_integrator(key: str, 
     parameters[key] = old
     parameters.update()
     np.testing.assert_allclose(render(integrator), before, atol=1e-5)
+
+
+def textured_box(degree: int = 1) -> Splats:
+    """Return Gaussians on a box whose colours depend on the direction."""
+    random = np.random.default_rng(4)
+    points = random.uniform(-1, 1, (600, 3)) * [0.2, 0.12, 0.08]
+    scales = np.full((600, 3), 0.02) * random.uniform(0.5, 1, (600, 3))
+    sh = random.normal(0, 0.2, (600, (degree + 1) ** 2, 3))
+    return Splats(points, np.tile([0, 0, 0, 1], (600, 1)), scales, np.full(600, 0.9), sh)
+
+
+def turned(angle: float, x: float, scale: float = 1.0) -> Any:
+    return mi.ScalarTransform4f().translate([x, 0.1, 0.2]).rotate([0.6, 0, 0.8], angle).scale(scale)
+
+
+@pytest.mark.parametrize("instance", [0, 2])
+@pytest.mark.parametrize("scale", [1.0, 1.6])
+def test_splats_that_are_moved_equal_splats_that_are_loaded_there(instance: int, scale: float) -> None:
+    """Splats, their colours, proxy, shadow and ids move, for surroundings and for one of two equal objects."""
+    ensure_variant()
+    splats, proxy = textured_box(), trimesh.creation.box((0.4, 0.24, 0.16))
+    at = mi.ScalarTransform4f()
+
+    def scene_of(pose: Any) -> Any:
+        return mi.load_dict(
+            {
+                "type": "scene",
+                "sensor": {
+                    "type": "perspective",
+                    "fov": 50,
+                    "to_world": at.look_at(origin=[0, -1.2, 1], target=[0, 0, 0.1], up=[0, 0, 1]),
+                    "film": {"type": "hdrfilm", "width": 48, "height": 36},
+                },
+                "table": {"type": "rectangle"},
+                "other": make_splats_shape(splats, np.array(turned(20, 0.3).matrix), proxy, instance=1),
+                "part": make_splats_shape(splats, np.array(pose.matrix), proxy, instance=instance),
+                "lamp": {"type": "point", "position": [0.3, 0.2, 1.5], "intensity": 4.0},
+            }
+        )
+
+    integrator = make_integrator(shadow_samples=16, shadow_error=0)
+    scene = scene_of(turned(0, -0.2))
+    before = [np.array(integrator.render(scene)) for _ in range(3)][-1]
+    parameters = mi.traverse(scene)
+    target = turned(130, -0.35, scale)
+    parameters["part.to_world"] = mi.Transform4f(target)
+    parameters.update()
+    after = np.array(integrator.render(scene))
+    truth = np.array(make_integrator(shadow_samples=16, shadow_error=0).render(scene_of(target)))
+    assert np.abs(after - before).max() > 0.3
+    np.testing.assert_allclose(after, truth, atol=1e-5)
+    np.testing.assert_allclose(np.array(mi.traverse(scene)["part.to_world"].matrix)[..., 0], np.array(target.matrix))
+
+
+def test_the_camera_plugin_can_be_moved() -> None:
+    ensure_variant()
+    at = mi.ScalarTransform4f()
+    start, end = (at.look_at(origin=eye, target=[0, 0, 0], up=[0, 0, 1]) for eye in ([0, -1.2, 1], [0.5, -1, 0.8]))
+
+    def sensor_at(pose: Any) -> Any:
+        film = {"type": "hdrfilm", "width": 24, "height": 16}
+        return mi.load_dict({"type": "opencv_camera", "fx": 25.0, "fy": 25.0, "to_world": pose, "film": film})
+
+    scene, integrator, sensor = make_scene(), make_integrator(shadow_samples=4), sensor_at(start)
+    integrator.render(scene, sensor)
+    parameters = mi.traverse(sensor)
+    parameters["to_world"] = mi.Transform4f(end)
+    parameters.update()
+    truth = np.array(make_integrator(shadow_samples=4).render(scene, sensor_at(end)))
+    np.testing.assert_allclose(np.array(integrator.render(scene, sensor)), truth, atol=1e-5)
+    parameters["to_world"] = mi.Transform4f(end) @ mi.Transform4f().scale(2)
+    with pytest.raises(InputError, match=r"^sensor 'opencv_camera': 'to_world' must be a rotation and a translation$"):
+        parameters.update()
+
+
+def test_a_transform_that_deforms_moved_splats_is_refused() -> None:
+    ensure_variant()
+    shape = make_splats_shape(nothing(), np.array(turned(10, 0.1).matrix))
+    parameters = mi.traverse(shape)
+    assert list(parameters.keys()) == ["to_world"]
+    parameters["to_world"] = mi.Transform4f().scale([1, 1, 2])
+    with pytest.raises(InputError, match=r"^shape 'splats': 'to_world': a transform must scale uniformly"):
+        parameters.update()
 
 
 def test_the_seed_may_be_a_device_value() -> None:

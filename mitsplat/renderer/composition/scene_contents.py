@@ -62,7 +62,7 @@ class ContentsReader:
     def __init__(self) -> None:
         self._contents: SceneContents | None = None
         self._uploaded: list[tuple[Splats, Cloud]] = []
-        self._grid: tuple[mi.Shape, RadianceGrid | None] | None = None
+        self._grid: tuple[ShapeState, RadianceGrid | None] | None = None
 
     def read(self, scene: mi.Scene, splat_shadows: bool) -> SceneContents:
         """Upload the data of the shapes unless they are those of the last call.
@@ -111,8 +111,8 @@ class ContentsReader:
         if not static:
             return None
         largest = max(static, key=lambda c: len(c.splats))
-        if self._grid is None or self._grid[0] is not largest:
-            self._grid = largest, RadianceGrid.build(largest.splats, largest.world_from_splats)
+        if self._grid is None or not self._grid[0].holds_for([largest]):
+            self._grid = ShapeState.of([largest]), RadianceGrid.build(largest.splats, largest.world_from_splats)
         return self._grid[1]
 
     def _upload(self, distinct: list[Splats]) -> CloudSet | None:

@@ -12,12 +12,13 @@ import mitsuba as mi
 
 @dataclass(frozen=True, eq=False)
 class ShapeState:
-    """Shapes, and the parameters of those that are not splats, which have none of their own.
+    """Shapes, and their parameters; those of splats are their poses.
 
     Attributes:
         shapes: The shapes.
         arrays: Copies of all arrays. They keep the variables of Dr.Jit alive, whose indices are compared.
-        values: Key of each parameter with its values; a variable of Dr.Jit is represented by its index.
+        values: Poses of splats, and the key of each other parameter with its values; a variable of Dr.Jit is
+            represented by its index.
     """
 
     shapes: tuple[mi.Shape, ...]
@@ -31,6 +32,7 @@ class ShapeState:
         values: list[object] = []
         for shape in shapes:
             if hasattr(shape, "world_from_splats"):
+                values.append(shape.world_from_splats.tobytes())
                 continue
             for key, value in mi.traverse(shape):
                 values.append(key)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from mitsplat.cli.console import stage_bar
-from mitsplat.cli.options import check_new, parse_number, parse_pair
+from mitsplat.cli.options import check_new, given_options, parse_number, parse_pair, refuse_options
 from mitsplat.errors import InputError, PartialResultError
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ Box = Annotated[
 
 
 def capture(
+    context: typer.Context,
     photos: Photos,
     out: Annotated[Path, typer.Option("--out", "-o", help="Capture folder to write.")],
     kind: Annotated[
@@ -89,6 +90,7 @@ def capture(
     from mitsplat.capture.pipeline.capture_pipeline import capture_photos
     from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 
+    refuse_frames(context, photos)
     settings = CaptureSettings(
         kind=kind,
         frames=frames,
@@ -124,6 +126,12 @@ def capture(
     typer.echo(f"picture: {out / 'capture.png'}")
     if result.shortcoming is not None:
         raise PartialResultError(f"{out}: {result.shortcoming}")
+
+
+def refuse_frames(context: typer.Context, photos: Path) -> None:
+    """Raise InputError if the option ``--frames`` is given for a folder of photographs."""
+    if photos.is_dir():
+        refuse_options({"--frames"} & given_options(context), f"photographs ({photos}), which are all used")
 
 
 def parse_distance(scale_from: tuple[str, str, str] | None) -> tuple[str, str, float] | None:

@@ -23,6 +23,7 @@ from mitsplat.cli.captures import (
     Poses,
     ScaleFrom,
     parse_distance,
+    refuse_frames,
 )
 from mitsplat.cli.console import progress_bar, select_device, stage_bar
 from mitsplat.cli.options import (
@@ -255,6 +256,7 @@ def mesh(
 
 
 def asset(
+    context: typer.Context,
     photos: Photos,
     out: AssetFolder,
     name: Name = None,
@@ -290,6 +292,7 @@ def asset(
     from mitsplat.reconstruct.pipeline.asset_pipeline import asset_from_photos, default_fit
     from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
 
+    refuse_frames(context, photos)
     job = AssetJob(
         name=name or out.resolve().name,
         class_name=class_name,

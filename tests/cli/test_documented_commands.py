@@ -109,9 +109,10 @@ def form(words: list[str]) -> tuple[str, ...]:
 def smaller(words: list[str]) -> list[str]:
     """Make a documented command fast.
 
-    A Mitsuba scene states its own size, and a single image takes no ``-n``.
+    A Mitsuba scene states its own size, a single image takes no ``-n``, and photographs take no ``--frames``.
     """
-    added = [] if words[2:3] == ["frame.xml"] else SMALLER.get(words[1], [])
+    is_whole = words[2:3] == ["frame.xml"] or (words[1] == "capture" and not Path(words[2]).suffix)
+    added = [] if is_whole else SMALLER.get(words[1], [])
     kept = list(words)
     for option in (word for word in added if word.startswith("-")):
         if option in kept:

@@ -122,6 +122,19 @@ def test_capture_passes_every_option_on(monkeypatch: pytest.MonkeyPatch, tmp_pat
         assert calls.args == (Path("photos"), tmp_path, CaptureSettings(**told, **further))
 
 
+@pytest.mark.parametrize("command", ["capture", "asset"])
+@pytest.mark.parametrize("count", [0, 40])
+def test_a_number_of_video_frames_is_refused_for_photographs(
+    command: str, count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "photos").mkdir()
+    assert run(command, tmp_path / "photos", "-o", tmp_path / "out", "--frames", count) == 2
+    message = f"mitsplat: --frames does not apply to photographs ({tmp_path / 'photos'}), which are all used"
+    assert capsys.readouterr().err.splitlines()[-1] == message
+    assert run(command, tmp_path / "photos", "-o", tmp_path / "out") == 2
+    assert "must hold at least 3 photographs (got 0)" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("kind", ["object", "environment"])
 def test_mesh_passes_every_option_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str

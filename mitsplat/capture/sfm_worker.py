@@ -1,8 +1,8 @@
 """Structure from motion by pycolmap, in a separate process: ``python -m mitsplat.capture.sfm_worker JOB``.
 
-pycolmap can abort its process, and it breaks zlib if zlib was not used before the import. So no other module imports
-it. :mod:`mitsplat.capture.structure_from_motion` starts this module, monitors its progress and reads the results in the
-job's folder.
+pycolmap can abort its process, and it breaks zlib if zlib was not used before the import. So other processes do not
+import it. :mod:`mitsplat.capture.structure_from_motion` starts this module, monitors its progress and reads the results
+in the job's folder.
 
 JOB is a JSON file, see :func:`run`. In the same folder, ``model.npz`` is the result and ``status`` the present
 activity.
@@ -26,6 +26,7 @@ zlib.compress(b"before pycolmap")
 import numpy as np  # noqa: E402
 import pycolmap  # noqa: E402
 
+from mitsplat.capture.lens_separation import assign_new_camera, second_lens  # noqa: E402
 from mitsplat.runtime.child_process import limit_memory  # noqa: E402
 from mitsplat.runtime.cores import usable_cores  # noqa: E402
 
@@ -43,6 +44,9 @@ MAX_TRIALS = 2000
 
 Most of the time of matching is spent on pairs with fewer inliers, because these show no common surface.
 """
+
+MAX_LENSES = 3
+"""Maximum number of lenses that are separated."""
 
 BLOCK = 12
 """Images per block of exhaustive matching; results are stored, and progress is visible, per pair of blocks."""
@@ -219,6 +223,29 @@ def match(job: JsonObject, database: Path, folder: Path) -> None:
 def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list[pycolmap.Reconstruction]:
     """Reconstruct all models and return them, the largest first.
 
+    If photos that share a camera are of lenses with different focal lengths, all models are reconstructed again with a
+    camera for each lens.
+    """
+    models, separated = find_models(images, database, folder, "models", enough), database
+    for number in range(1, MAX_LENSES):
+        if not (models and (longer := second_lens(models[0]))):
+            break
+        trial = folder / f"lens{number}.db"
+        shutil.copyfile(separated, trial)
+        assign_new_camera(trial, longer)
+        again = find_models(images, trial, folder, f"lens{number}", enough)
+        errors = [found[0].compute_mean_reprojection_error() for found in (again, models) if found]
+        if not again or again[0].num_reg_images() < models[0].num_reg_images() or errors[0] >= errors[1]:
+            break
+        models, separated = again, trial
+    for trial in folder.glob("lens?.db"):
+        trial.unlink()
+    return models
+
+
+def find_models(images: Path, database: Path, folder: Path, name: str, enough: int) -> list[pycolmap.Reconstruction]:
+    """Reconstruct all models, write them to the subfolder ``name``, and return them, the largest first.
+
     The incremental mapper is used. The global mapper is used if it registers more photos.
     """
     write_status(folder, "finding cameras")
@@ -230,7 +257,7 @@ def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list
         registered += 1
         write_status(folder, f"finding cameras {registered}")
 
-    output = folder / "models"
+    output = folder / name
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir()
     found = pycolmap.incremental_mapping(database, images, output, options, next_image_callback=count)

@@ -121,6 +121,8 @@ def capture(
     scale = "in metres" if found.units == "metre" else "in unknown units"
     error = "" if found.scale_error is None else f" ± {found.scale_error:.2%}"
     typer.echo(f"frame: {scale}{error}, {'z up' if found.up == 'z' else 'up unknown'}, by {result.source}")
+    if result.lenses is not None:
+        typer.echo(f"focal lengths: {result.lenses}")
     if result.exposure is not None:
         typer.echo(f"exposure: {result.exposure}")
     typer.echo(f"picture: {out / 'capture.png'}")

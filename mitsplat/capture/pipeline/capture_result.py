@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from mitsplat.capture.structure_from_motion import MIN_POINTS
 from mitsplat.capture.video import ChosenFrames
 
 _MAX_LISTED = 3
-"""Number of pictures that a warning lists."""
+"""Maximum number of pictures that a warning lists, and of lenses that are listed."""
 
 FEW_POINTS = 3 * MIN_POINTS
 """Number of observed points below which a camera causes a warning."""
@@ -53,6 +54,14 @@ class CaptureResult:
         """Range of the corrected exposure differences as a clause; None without correction."""
         gains = [np.log(photo.gain).mean() for photo in self.capture.photos if photo.gain is not None]
         return f"photos differ by up to {np.expm1(np.ptp(gains)):.0%}; this is corrected" if gains else None
+
+    @property
+    def lenses(self) -> str | None:
+        """Focal lengths of the photos and their numbers as a clause; None for one lens, or one for each few photos."""
+        counts = Counter(round(photo.camera.fx) for photo in self.capture.photos)
+        if not 1 < len(counts) <= _MAX_LISTED:
+            return None
+        return " and ".join(f"{length} px in {count} photos" for length, count in sorted(counts.items()))
 
     @property
     def weak(self) -> dict[str, int]:

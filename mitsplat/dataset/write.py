@@ -33,7 +33,7 @@ from mitsplat.dataset.dataset_files import SHEET, TIMINGS, layout_file, remove_f
 from mitsplat.dataset.dataset_folder import append_run, content_of, finish_folder, open_folder
 from mitsplat.dataset.frame_job import FrameJob, RemoteFrameJob, Render, Settle, layout_errors
 from mitsplat.dataset.preflight import refuse, run_faults
-from mitsplat.dataset.records.manifest import append_line
+from mitsplat.dataset.records.manifest import Manifest, append_line
 from mitsplat.dataset.shard_file import Shard
 from mitsplat.engine.pool import check_workers, run_frames
 from mitsplat.engine.ray import Cluster, load_ray, run_on_ray
@@ -152,41 +152,15 @@ def write_dataset(
         used_device = current_device() if device is None else find_device(device)
     content = content_of(scene, catalogue, used_device.kind)
     part = None if shard is None else shard.to_json(count)
+    job = FrameJob(scene, catalogue, out, render or render_frame, settle or settle_layout)
+    run = _Run(job, indices, count, workers, cluster, used_device, progress)
     with open_folder(
         out, content, scene.path, part, resume=True, overwrite=overwrite, any_device=any_device
     ) as manifest:
-        missing = (index for index in indices if index not in manifest)
-        layouts = {layout: list(found) for layout, found in groupby(missing, partial(layout_index_of, scene))}
-
-        def note(text: str) -> None:
-            if progress is not None:
-                progress(len(manifest), max(len(indices), len(manifest)), text)
-
-        note("starting")
-        if used_device.reason:
-            note(f"device {used_device}: {used_device.reason}")
-        if layouts:
-            _begin_run(out, workers, used_device)
-        # The dataset may have more frames than were asked for.
-        present = sorted({layout_index_of(scene, index) for index in chain(indices, manifest.indices)})
-        incomplete = IncompleteLayouts(scene, max(-(-count // scene.spec.output.views), len(present)))
-        for layout in present:
-            incomplete.read(out / layout_file(layout))
-        job = FrameJob(scene, catalogue, out, render or render_frame, settle or settle_layout)
-        num_missing = sum(map(len, layouts.values()))
-        unsettled = [layout for layout in layouts if settle is not None or not is_cached(scene, layout)]
-        run_time = RunTime(len(unsettled), num_missing, settles_first=min(layouts, default=0) in unsettled)
-        with closing(_results(job, layouts, workers, cluster, used_device, note)) as results:
-            for record, seconds in results:
-                append_line(out / TIMINGS, {"index": record["index"], **seconds})
-                manifest.append(record)
-                note(f"frame {record['index']}")
-                if estimate := run_time.add(seconds):
-                    note(f"{TIME_NOTE}{estimate}")
-                incomplete.add(record["layout"], [(one["name"], one["reason"]) for one in record.get("left_out", ())])
+        rendered = run.render_missing(manifest)
         counts = FrameCounts()
         finish_folder(out, manifest, content, catalogue, counts.add)
-        return counts.summary(out, rendered=num_missing)
+        return counts.summary(out, rendered)
 
 
 def _frame_count(scene: Scene, frames: int | None) -> int:
@@ -204,36 +178,96 @@ def _frame_count(scene: Scene, frames: int | None) -> int:
     return count
 
 
-def _begin_run(out: Path, workers: int | None, device: Device) -> None:
-    """Record a run that adds images, and remove lists of folds, which do not contain them."""
-    if remove_folds(out):
-        _logger.warning(
-            "%s: the lists of folds do not contain the new images and are removed: run `mitsplat split` again", out
-        )
-    append_run(out, workers, device.kind, [gpu.name for gpu in device.gpus])
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """Run that renders the frames that a dataset lacks.
 
+    Attributes:
+        job: Job that renders a frame and writes its files.
+        indices: Frames of this dataset or shard.
+        frames: Number of frames of the dataset, all its shards together.
+        workers: Number of worker processes, see :func:`write_dataset`.
+        cluster: Cluster that renders the frames; processes of this machine if None.
+        device: Device that renders the frames.
+        progress: Progress callback.
+    """
 
-def _results(
-    job: FrameJob,
-    layouts: dict[int, list[int]],
-    workers: int | None,
-    cluster: Cluster | None,
-    device: Device,
-    note: Note,
-) -> Generator[tuple[Record, dict[str, float]]]:
-    """Yield the record and the seconds of the stages of each frame, after its files were written to the folder."""
-    if cluster is None:
-        memory = TYPICAL_MEMORY if workers is not None else worker_memory(job.scene)
-        prepare = job.settle_ahead
-        with closing(
-            run_frames(job, layouts, workers=workers, note=note, memory=memory, device=device, prepare=prepare)
-        ) as results:
-            yield from results
-        return
-    with closing(run_on_ray(RemoteFrameJob(job), layouts, cluster, workers=workers, note=note)) as frames:
-        for frame in frames:
-            with storage_errors(job.out):
-                yield frame.write(job.out), frame.seconds
+    job: FrameJob
+    indices: range
+    frames: int
+    workers: int | None
+    cluster: Cluster | None
+    device: Device
+    progress: Progress | None
+
+    def render_missing(self, manifest: Manifest) -> int:
+        """Render the frames that the manifest lacks, add them to it, and return their number.
+
+        Raises:
+            InputError: If more layouts lack objects than the scene allows.
+        """
+        scene, out = self.job.scene, self.job.out
+        missing = (index for index in self.indices if index not in manifest)
+        layouts = {layout: list(found) for layout, found in groupby(missing, partial(layout_index_of, scene))}
+
+        def note(text: str) -> None:
+            if self.progress is not None:
+                self.progress(len(manifest), max(len(self.indices), len(manifest)), text)
+
+        note("starting")
+        if self.device.reason:
+            note(f"device {self.device}: {self.device.reason}")
+        if layouts:
+            self._begin()
+        incomplete = self._incomplete_layouts(manifest)
+        num_missing = sum(map(len, layouts.values()))
+        is_replaced = self.job.settle is not settle_layout
+        unsettled = [layout for layout in layouts if is_replaced or not is_cached(scene, layout)]
+        run_time = RunTime(len(unsettled), num_missing, settles_first=min(layouts, default=0) in unsettled)
+        with closing(self._results(layouts, note)) as results:
+            for record, seconds in results:
+                append_line(out / TIMINGS, {"index": record["index"], **seconds})
+                manifest.append(record)
+                note(f"frame {record['index']}")
+                if estimate := run_time.add(seconds):
+                    note(f"{TIME_NOTE}{estimate}")
+                incomplete.add(record["layout"], [(one["name"], one["reason"]) for one in record.get("left_out", ())])
+        return num_missing
+
+    def _begin(self) -> None:
+        """Record a run that adds images, and remove lists of folds, which do not contain them."""
+        out = self.job.out
+        if remove_folds(out):
+            _logger.warning(
+                "%s: the lists of folds do not contain the new images and are removed: run `mitsplat split` again", out
+            )
+        append_run(out, self.workers, self.device.kind, [gpu.name for gpu in self.device.gpus])
+
+    def _incomplete_layouts(self, manifest: Manifest) -> IncompleteLayouts:
+        """Return the count of layouts that lack objects, with those that earlier runs settled."""
+        scene = self.job.scene
+        # The dataset may have more frames than were asked for.
+        present = sorted({layout_index_of(scene, index) for index in chain(self.indices, manifest.indices)})
+        incomplete = IncompleteLayouts(scene, max(-(-self.frames // scene.spec.output.views), len(present)))
+        for layout in present:
+            incomplete.read(self.job.out / layout_file(layout))
+        return incomplete
+
+    def _results(self, layouts: dict[int, list[int]], note: Note) -> Generator[tuple[Record, dict[str, float]]]:
+        """Yield the record and the seconds of the stages of each frame, after its files were written to the folder."""
+        job, workers = self.job, self.workers
+        if self.cluster is None:
+            memory = TYPICAL_MEMORY if workers is not None else worker_memory(job.scene)
+            prepare, device = job.settle_ahead, self.device
+            with closing(
+                run_frames(job, layouts, workers=workers, note=note, memory=memory, device=device, prepare=prepare)
+            ) as results:
+                yield from results
+            return
+        with closing(run_on_ray(RemoteFrameJob(job), layouts, self.cluster, workers=workers, note=note)) as frames:
+            for frame in frames:
+                with storage_errors(job.out):
+                    yield frame.write(job.out), frame.seconds
 
 
 class IncompleteLayouts:

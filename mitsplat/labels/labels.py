@@ -307,14 +307,10 @@ def _label_instance(
     silhouette = truth.silhouettes.get(instance.id)
     amodal, box, area = _amodal(silhouette, visible, rules.min_fragment, (width, height))
     agreement, boundary = _agreement(visible, truth.second, instance.id, second_bounds)
-    marks = tuple(
-        name
-        for name, value, least in (
-            ("occluded", visible.area / amodal.area, rules.min_visible),
-            ("disagreeing", agreement, rules.min_agreement),
-        )
-        if value < least
-    )
+    is_marked = {
+        "occluded": visible.area / amodal.area < rules.min_visible,
+        "disagreeing": agreement < rules.min_agreement,
+    }
     return InstanceLabel(
         id=instance.id,
         asset=instance.asset,
@@ -325,12 +321,12 @@ def _label_instance(
         amodal=amodal,
         silhouette_box=box,
         silhouette_area=area,
-        depth_area=_with_depth(amodal, truth),
+        depth_area=_depth_area(amodal, truth),
         agreement=agreement,
         boundary_f1=boundary,
         truncation=1 - amodal.area / (area + (0.0 if silhouette is None else silhouette.beyond)),
         world_from_object=instance.world_from_object,
-        marks=marks,
+        marks=tuple(mark for mark, holds in is_marked.items() if holds),
     )
 
 
@@ -397,7 +393,7 @@ def _project_keypoints(
     return keypoints
 
 
-def _with_depth(amodal: Silhouette, truth: Truth) -> int:
+def _depth_area(amodal: Silhouette, truth: Truth) -> int:
     """Return the number of pixels of a silhouette at which the image has a depth."""
     x0, y0, x1, y1 = amodal.box
     return int(np.count_nonzero(amodal.mask & (truth.depth[y0:y1, x0:x1] > 0)))

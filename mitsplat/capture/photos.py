@@ -91,12 +91,12 @@ class _MeasuredPhoto:
     brightest: int
 
 
-def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
+def find_photos(folder: Path, *, masks: Path | None = None) -> list[Path]:
     """Return the photographs below a folder and its linked folders, sorted; hidden files are excluded.
 
     Args:
         folder: Folder of the photographs.
-        but: Folder whose pictures are excluded.
+        masks: Folder of masks, which are no photographs.
 
     Raises:
         InputError: If the folder does not exist, the name of a photograph is not UTF-8, or two photographs would have
@@ -105,7 +105,7 @@ def find_photos(folder: Path, *, but: Path | None = None) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"{folder}: must be an existing folder of photographs, or a video")
     found: dict[str, Path] = {}
-    for path in files_below(folder, skip=but):
+    for path in files_below(folder, skip=masks):
         name = path.relative_to(folder).as_posix()
         if path.suffix.lower() not in SUFFIXES + _UNSUPPORTED or not path.is_file() or "/." in f"/{name}":
             continue
@@ -120,8 +120,7 @@ def prepare_photos(
     folder: Path,
     out: Path,
     *,
-    but: Path | None = None,
-    skip: Collection[str] = (),
+    excluded: Collection[str] = (),
     max_size: int,
     upright: bool = True,
     masks: Path | None = None,
@@ -134,13 +133,13 @@ def prepare_photos(
 
     Args:
         folder: Folder of photographs, at any depth.
-        but: Folder whose pictures are excluded.
-        skip: Names of pictures that are excluded.
         out: Folder of the copies; existing copies are reused.
+        excluded: Names of pictures without a copy.
         max_size: Longest edge of the copies [px].
         upright: Apply the EXIF orientation. Without it, cameras are known, and photos may be rendered: a plain
             background is not judged then.
-        masks: Folder of masks of the object. A photo is too dark or too bright only if the object is too.
+        masks: Folder of masks of the object, see :func:`find_photos`. A photo is too dark or too bright only if the
+            object is too.
         progress: Callback with the number of finished photos.
 
     Returns:
@@ -149,7 +148,7 @@ def prepare_photos(
     Raises:
         InputError: As :func:`find_photos`.
     """
-    files = [path for path in find_photos(folder, but=but) if path.relative_to(folder).as_posix() not in skip]
+    files = [path for path in find_photos(folder, masks=masks) if path.relative_to(folder).as_posix() not in excluded]
     out.mkdir(parents=True, exist_ok=True)
     measured: list[_MeasuredPhoto] = []
     rejected: dict[str, str] = {}

@@ -92,7 +92,7 @@ class SparseModel:
     reprojection_error: float = float("nan")
     agreement: Mapping[str, float] = field(default_factory=dict)
 
-    def without_weak(self, min_points: int = MIN_POINTS) -> tuple[SparseModel, dict[str, int]]:
+    def without_weak_images(self, min_points: int = MIN_POINTS) -> tuple[SparseModel, dict[str, int]]:
         """Return the model without images that observe fewer points, and the number of points that those observe.
 
         Points that fewer than two remaining images observe are removed too, which can make more images weak.
@@ -101,10 +101,10 @@ class SparseModel:
         weak = {name: count for name, count in counts.items() if count < min_points}
         if not weak:
             return self, {}
-        rest, weaker = self.without(weak).without_weak(min_points)
+        rest, weaker = self.without_images(weak).without_weak_images(min_points)
         return rest, weak | weaker
 
-    def without(self, names: Collection[str]) -> SparseModel:
+    def without_images(self, names: Collection[str]) -> SparseModel:
         """Return the model without the named images, and without points that fewer than two other images observe."""
         kept = [name for name in self.cameras if name not in names]
         stays = count_observers([self.seen[name] for name in kept], len(self.points)) >= 2

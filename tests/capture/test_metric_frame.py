@@ -327,7 +327,7 @@ def test_weak_images_are_dropped_with_the_points_that_only_they_observe() -> Non
     model = model_of(ring(4), np.random.default_rng(0).normal(size=(100, 3)))
     seen = [np.arange(0, 60), np.arange(0, 60), np.arange(50, 95), np.arange(70, 95)]
     model = replace(model, seen=dict(zip(model.cameras, (part.astype(np.int32) for part in seen), strict=True)))
-    rest, weak = model.without_weak(30)
+    rest, weak = model.without_weak_images(30)
     assert weak == {"03.png": 25, "02.png": 10}  # without 03, 02 shares only ten points
     assert list(rest.cameras) == ["00.png", "01.png"]
     np.testing.assert_array_equal(rest.points, model.points[:60])

@@ -144,7 +144,7 @@ def test_photos_are_found_through_links_and_masks_are_ignored(folder: Path) -> N
     (folder / "around").symlink_to(folder)
     (folder / "masks").mkdir()
     Image.new("L", (80, 60)).save(folder / "masks/0.png")
-    found = find_photos(folder, but=folder / "masks")
+    found = find_photos(folder, masks=folder / "masks")
     assert [path.relative_to(folder).as_posix() for path in found] == ["0.png", "1.png", "2.png", "linked/7.PNG"]
 
 

@@ -86,7 +86,7 @@ def capture_photos(
 
 def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progress | None) -> CaptureResult:
     """Make the capture of a folder of photographs."""
-    files = find_photos(photos, but=settings.masks)
+    files = find_photos(photos, masks=settings.masks)
     if len(files) < MIN_PHOTOS:
         raise InputError(f"{photos}: must hold at least {MIN_PHOTOS} photographs (got {len(files)})")
     inputs = _inputs(photos, files, settings)
@@ -104,8 +104,7 @@ def _capture(photos: Path, out: Path, settings: CaptureSettings, progress: Progr
     prepared, rejected = prepare_photos(
         photos,
         out / "images",
-        but=settings.masks,
-        skip={*unnamed, *copies},
+        excluded={*unnamed, *copies},
         max_size=settings.max_size,
         upright=settings.poses is None,
         masks=settings.masks,
@@ -271,17 +270,16 @@ def _find_model(
     model, faults = given, dict[str, str]()
     if model is None:
         model, faults = _remove_faulty_cameras(find_cameras(list(by_file.values()), work, progress))
-    _check_camera_count(photos, model, by_file, faults)
-    frame = _metric_frame(model, by_file, settings)
-    while frame.wrong:
-        faults |= {
-            file: f"its camera is wrong: it sees the board {error:.0f} px from its position"
-            for file, error in frame.wrong.items()
-        }
-        model, further = _remove_faulty_cameras(model.without(frame.wrong), least=0 if settings.poses else MIN_POINTS)
-        faults |= further
+    while True:
         _check_camera_count(photos, model, by_file, faults)
         frame = _metric_frame(model, by_file, settings)
+        if not frame.wrong:
+            break
+        for file, error in frame.wrong.items():
+            faults[file] = f"its camera is wrong: it sees the board {error:.0f} px from its position"
+        rest, least = model.without_images(frame.wrong), 0 if settings.poses else MIN_POINTS
+        model, further = _remove_faulty_cameras(rest, least)
+        faults |= further
     absent = "the given poses do not contain it" if settings.poses else "it shares too few points with the other photos"
     elsewhere = "it matches only a smaller group of photos, for example of another object or side"
     for file in by_file.keys() - model.cameras.keys() - faults.keys():
@@ -306,7 +304,7 @@ def _remove_faulty_cameras(model: SparseModel, least: int = MIN_POINTS) -> tuple
     """Remove cameras that contradict the others or observe fewer than ``least`` points, and return the reasons."""
     shares = {file: model.agreement.get(file, 1.0) for file in model.cameras}
     wrong = {file: share for file, share in shares.items() if share < MIN_AGREEMENT}
-    model, weak = model.without(wrong).without_weak(least)
+    model, weak = model.without_images(wrong).without_weak_images(least)
     faults = {
         file: f"its camera is wrong: it agrees with only {share:.0%} of its matches" for file, share in wrong.items()
     }

@@ -6,6 +6,7 @@ The command imports its dependencies inside its function, so that all other comm
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,7 +16,7 @@ from mitsplat.cli.options import check_ending, parse_number
 from mitsplat.errors import InputError
 
 if TYPE_CHECKING:
-    from mitsplat.capture.lighting import LightEstimate
+    from mitsplat.capture.lighting import BallReading, LightEstimate
 
 _PERFECT_MIRROR = (1.0, 1.0, 1.0)
 _WHITE_IRRADIANCE = math.pi
@@ -95,39 +96,51 @@ def lights(
     check_ending(out, ".yaml", ".yml")
     refuse_to_replace(out, images)
     is_hdr = images[0].suffix.lower() in HDR_SUFFIXES
-    if camera is not None and rotate_z:
-        raise InputError(f"--rotate-z applies to panoramas; for a mirror ball, use --camera (got {rotate_z:g})")
-    if camera is None and (len(images) > 1 or not is_hdr):
-        raise InputError(
-            f"{images[-1]}: must be the only input and an HDR panorama, {', '.join(HDR_SUFFIXES)}; for photographs "
-            "of a mirror ball, add --camera AZIMUTH ELEVATION"
-        )
     of_ball = ball is not None or fov_x is not None or exposures is not None or reflectivity != _PERFECT_MIRROR
-    if camera is None and of_ball:
-        raise InputError(
-            "--ball, --fov-x, --exposures and --reflectivity apply to photographs of a mirror ball: add --camera"
-        )
+    if camera is None:
+        _check_panorama(images, of_ball=of_ball)
+    elif rotate_z:
+        raise InputError(f"--rotate-z applies to panoramas; for a mirror ball, use --camera (got {rotate_z:g})")
     if irradiance is None and not is_hdr:
         irradiance = _WHITE_IRRADIANCE
-    settings, photograph = LightSettings(around, distance, lamps, rest, rotate_z, irradiance), None
+    settings = LightSettings(around, distance, lamps, rest, rotate_z, irradiance)
     if camera is None:
-        panorama = read_panorama(images[0])
+        panorama, photograph = read_panorama(images[0]), None
     else:
         times = None if exposures is None else _parse_times(exposures)
-        view = BallView(*camera, ball=ball, fov_x=fov_x, exposures=times, reflectivity=reflectivity)
-        found = read_ball(images, view)
+        found = read_ball(images, BallView(*camera, ball=ball, fov_x=fov_x, exposures=times, reflectivity=reflectivity))
+        _print_ball(found)
         panorama, photograph = found.panorama.radiance, found.picture
-        x, y, radius = found.ball
-        typer.echo(
-            f"ball: {x:.0f} {y:.0f} {radius:.0f} px; {found.panorama.blind:.0f} degrees around its rear are not "
-            "visible and are filled with the mean of a ring around them"
-        )
-        for warning in found.warnings:
-            typer.echo(f"warning: {warning}")
     estimate = estimate_light(panorama, settings)
     files = write_light(estimate, out, photograph)
     _print_lamps(estimate)
     typer.echo(f"lights: {', '.join(str(file) for file in files)}")
+
+
+def _check_panorama(images: Sequence[Path], *, of_ball: bool) -> None:
+    """Raise InputError if images without ``--camera`` are not one HDR panorama, or if options of a ball are given."""
+    from mitsplat.capture.lighting.panorama import HDR_SUFFIXES
+
+    if len(images) > 1 or images[0].suffix.lower() not in HDR_SUFFIXES:
+        raise InputError(
+            f"{images[-1]}: must be the only input and an HDR panorama, {', '.join(HDR_SUFFIXES)}; for photographs "
+            "of a mirror ball, add --camera AZIMUTH ELEVATION"
+        )
+    if of_ball:
+        raise InputError(
+            "--ball, --fov-x, --exposures and --reflectivity apply to photographs of a mirror ball: add --camera"
+        )
+
+
+def _print_ball(found: BallReading) -> None:
+    """Print the outline of a mirror ball, and warnings about its photographs."""
+    x, y, radius = found.ball
+    typer.echo(
+        f"ball: {x:.0f} {y:.0f} {radius:.0f} px; {found.panorama.blind:.0f} degrees around its rear are not "
+        "visible and are filled with the mean of a ring around them"
+    )
+    for warning in found.warnings:
+        typer.echo(f"warning: {warning}")
 
 
 def _print_lamps(estimate: LightEstimate) -> None:

@@ -11,7 +11,7 @@ distribution this share is 10 %.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
@@ -156,7 +156,8 @@ def compare_with_photographs(
 ) -> Likeness:
     """Compare rendered images with labelled photographs.
 
-    Colours are measured at pixels inside masks, or in the middle half of boxes without masks.
+    Colours are measured at pixels inside masks. If any label of a class is a box without a mask, on either side, they
+    are measured in the middle half of the boxes of all labels of this class.
 
     Args:
         rendered: mitsplat datasets, YOLO folders or COCO folders.
@@ -189,12 +190,13 @@ def compare_with_photographs(
     ours, theirs = (
         [side.samples[i] for i in evenly_spaced(len(side.samples), max_images)] for side in (rendered_side, real_side)
     )
+    only_boxes = frozenset(i.class_index for one in ours + theirs for i in one.instances if not (i.has_mask or i.crowd))
     sides: tuple[_Values, _Values] = defaultdict(list), defaultdict(list)
     hues: tuple[_HueSums, _HueSums] = defaultdict(_zero_hue_sums), defaultdict(_zero_hue_sums)
     for number, sample in enumerate(ours + theirs):
         if progress is not None:
             progress(number, len(ours) + len(theirs), "measuring images")
-        _measure(sample, number, size, sides[number >= len(ours)], hues[number >= len(ours)])
+        _measure(sample, number, size, only_boxes, sides[number >= len(ours)], hues[number >= len(ours)])
     least = MIN_RENDERED_OBJECTS, MIN_REAL_OBJECTS
     classes = {
         name: _traits(sides, index)
@@ -314,8 +316,19 @@ def _size_ratios(sides: tuple[_Values, _Values], classes: int) -> list[float]:
     return ratios
 
 
-def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _HueSums) -> None:
-    """Add the measurements of an image, scaled to a longer side of ``size`` pixels, to ``values`` and ``hues``."""
+def _measure(
+    sample: Sample, number: int, size: int, only_boxes: Collection[int], values: _Values, hues: _HueSums
+) -> None:
+    """Add the measurements of an image to ``values`` and ``hues``.
+
+    Args:
+        sample: The image and its labels.
+        number: Number of the image.
+        size: Longer side to which the image is scaled [px].
+        only_boxes: Indices of the classes whose colours are measured within boxes.
+        values: Measurements of one side.
+        hues: Sums of hue histograms of one side.
+    """
     stored = read_upright(sample.path)
     scale = size / max(sample.width, sample.height)
     width, height = (max(round(scale * side), 1) for side in (sample.width, sample.height))
@@ -330,7 +343,7 @@ def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _Hue
             cut += 1
         else:
             values[_UNCUT_SIZE, instance.class_index].append((number, side))
-        inside = _object_pixels(instance, sample, width, height)
+        inside = _object_pixels(instance, sample, width, height, as_box=instance.class_index in only_boxes)
         if inside.sum() >= _MIN_AREA:
             hues[instance.class_index] += _hue_histogram(picture[inside])
             pixels = picture[inside].astype(float)
@@ -348,10 +361,10 @@ def _measure(sample: Sample, number: int, size: int, values: _Values, hues: _Hue
         values["noise of images", None].append((number, noise))
 
 
-def _object_pixels(instance: LabelledObject, sample: Sample, width: int, height: int) -> BoolArray:
-    """Return the pixels of an object in the scaled image, shape (height, width)."""
+def _object_pixels(instance: LabelledObject, sample: Sample, width: int, height: int, *, as_box: bool) -> BoolArray:
+    """Return the pixels of an object in the scaled image, or of the middle half of its box, shape (height, width)."""
     factor = np.array([width / sample.width, height / sample.height])
-    if instance.has_mask:
+    if not as_box:
         return fill_polygon(instance.outline_points() * factor, width, height)
     inside = np.zeros((height, width), dtype=bool)
     (x0, y0), (x1, y1) = (np.array(corner) * factor for corner in (instance.box[:2], instance.box[2:]))

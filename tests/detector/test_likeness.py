@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from mitsplat.cli import app
 from mitsplat.detector.likeness import BRIGHTNESS, Likeness, Trait, _trait, compare_with_photographs
 from mitsplat.errors import InputError
-from tests.detector.painted import HEIGHT, HUES, WIDTH, write_coco, write_yolo
+from tests.detector.painted import HEIGHT, HUES, WIDTH, write_coco, write_yolo, yolo_text
 
 
 @pytest.fixture(scope="module")
@@ -129,12 +129,41 @@ def test_object_size_is_that_in_the_scaled_image(rendered: Path, photographs: Pa
 
 
 def test_all_forms_of_labels_give_the_same_traits(rendered: Path, tmp_path: Path) -> None:
+    """In images of twice the size, the middle half of each box is large enough to be measured."""
     found = [
-        compare_with_photographs([rendered], write_coco(tmp_path / form, 12, form=form), size=WIDTH)
+        compare_with_photographs([rendered], write_coco(tmp_path / form, 12, form=form), size=2 * WIDTH)
         for form in ("polygons", "lengths", "compressed", "boxes")
     ]
     for other in found[1:]:
         assert other.classes == found[0].classes
+
+
+def _write_rings(root: Path, count: int, *, first: int, boxes: bool) -> Path:
+    """Write a YOLO folder of red rings on grey, with masks or boxes as labels."""
+    (root / "images/train").mkdir(parents=True)
+    (root / "labels/train").mkdir(parents=True)
+    for number in range(count):
+        rng = np.random.default_rng(first + number)
+        image = np.clip(rng.normal(110, 20, (HEIGHT, WIDTH, 3)), 0, 255).astype(np.uint8)
+        mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+        cv2.circle(mask, (int(rng.integers(30, 60)), 32), int(rng.integers(20, 24)), 1, 4)
+        image[mask > 0] = HUES["disc"][::-1]
+        cv2.imwrite(str(root / f"images/train/{number}.png"), image)
+        (root / f"labels/train/{number}.txt").write_text(yolo_text([("disc", mask > 0)], boxes=boxes))
+    (root / "data.yaml").write_text("train: images/train\nnames: [disc, box]\n")
+    return root
+
+
+def test_boxes_of_one_side_make_both_sides_measured_within_boxes(tmp_path: Path) -> None:
+    """The middle of the box of a ring shows what lies behind it, which the masks of the other side exclude."""
+    masks = _write_rings(tmp_path / "masks", 30, first=0, boxes=False)
+    boxes = _write_rings(tmp_path / "boxes", 20, first=100, boxes=True)
+    found = compare_with_photographs([masks], boxes, size=WIDTH)
+    assert [one.name for one in (*found.traits, *found.classes["disc"]) if one.advice] == []
+    bright = found.classes["disc"][0]
+    assert np.allclose(bright.rendered, bright.real, atol=10) and bright.real[1] == pytest.approx(120, abs=20)
+    whole = _write_rings(tmp_path / "whole", 20, first=100, boxes=False)
+    assert compare_with_photographs([masks], whole, size=WIDTH).classes["disc"][0].real == (220,) * 3
 
 
 def test_photographs_of_another_size_are_compared(rendered: Path, photographs: Path, tmp_path: Path) -> None:

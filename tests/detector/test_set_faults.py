@@ -13,6 +13,7 @@ from PIL import Image
 
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.errors import InputError
+from tests.detector.painted import write_coco, write_yolo
 
 WIDTH, HEIGHT = 100, 80
 LINE = "0 0.5 0.5 0.2 0.25\n"
@@ -55,12 +56,38 @@ def test_labels_in_another_spelling_than_their_image_are_refused(
         read_set(root, "train")
 
 
+def test_images_without_labels_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """They may be images of which nobody has drawn the labels yet. An empty label file states that there are none."""
+    root = write_yolo(tmp_path / "yolo", {"train": 6})
+    for number in (1, 3, 4, 5):
+        (root / f"labels/train/00000{number}.txt").unlink()
+    (root / "labels/train/000002.txt").write_text("")
+    assert [len(sample.instances) for sample in read_set(root, "train").samples][1:] == [0] * 5
+    names = "images/train/000001.png, images/train/000003.png, images/train/000004.png and 1 more"
+    told = "of 6 images have no labels and count as images without objects"
+    assert caplog.messages == [f"{root}: 4 {told}; an empty label file confirms it: {names}"]
+    caplog.clear()
+    root = write_coco(tmp_path / "coco", 6)
+    path = root / "labels.json"
+    labels = json.loads(path.read_text())
+    labels["annotations"] = [one for one in labels["annotations"] if one["image_id"] != 20]
+    path.write_text(json.dumps(labels))
+    read_set(root, "train")
+    assert caplog.messages == [f"{root}: 1 {told}: p2.png"]
+    caplog.clear()
+    write_yolo(tmp_path / "whole", {"train": 2})
+    read_set(tmp_path / "whole", "train")
+    assert caplog.messages == []
+
+
 def test_labels_without_an_image_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     root = yolo(tmp_path / "a", ("a.png", "b.png"), ("a.txt", "c.txt", "d.txt"))
     assert [len(sample.instances) for sample in read_set(root, "train").samples] == [1, 0]
     folder = root / "labels/train"
     assert caplog.messages == [
-        f"{folder}: c.txt and 1 more are not used, because {root / 'images/train'} has no image of these names"
+        f"{folder}: c.txt and 1 more are not used, because {root / 'images/train'} has no image of these names",
+        f"{root}: 1 of 2 images have no labels and count as images without objects; an empty label file confirms it: "
+        "images/train/b.png",
     ]
     caplog.clear()
     (root / "chosen.txt").write_text("images/train/a.png\n")

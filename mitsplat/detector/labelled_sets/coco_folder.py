@@ -18,6 +18,7 @@ from mitsplat.detector.labelled_sets.labelled_set import (
     read_samples,
     relative_name,
     reorder_classes,
+    warn_of_unlabelled,
 )
 from mitsplat.detector.labelled_sets.pictures import check_complete, images_below
 from mitsplat.errors import InputError
@@ -103,6 +104,9 @@ def _coco_part(root: Path, split: Split, path: Path, content: JsonObject, progre
         return Sample(file, relative_name(root, file), width, height, tuple(instances.values()), shown.hexdigest())
 
     images = sorted(content["images"], key=lambda image: str(image.get("file_name")))
+    bare = [str(image.get("file_name")) for image in images if not by_image[image["id"]]]
+    if len(bare) < len(images):
+        warn_of_unlabelled(root, bare, len(images))
     return LabelledSet(root, "coco", split, names, read_samples(read, images, root, progress))
 
 

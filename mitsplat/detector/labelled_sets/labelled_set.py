@@ -26,6 +26,8 @@ Split = Literal["train", "val", "test", "all"]
 
 _OUTSIDE_TOLERANCE = 0.01
 """Largest distance of a position from the image, as a share of its sides; such positions are clipped."""
+_MAX_LISTED = 3
+"""Maximum number of images that a warning lists."""
 _PIXELS = 3.0
 """Positions above this share of the sides of an image are probably pixels."""
 
@@ -249,6 +251,16 @@ def read_samples(
     if not any(sample.instances for sample in samples):
         raise InputError(f"{root}: its {len(samples)} images have no labels")
     return tuple(samples)
+
+
+def warn_of_unlabelled(root: Path, names: Sequence[str], total: int, remedy: str = "") -> None:
+    """Log a warning if some of ``total`` images have no labels; ``names`` are those of these images."""
+    if names:
+        more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+        _logger.warning(
+            "%s: %d of %d images have no labels and count as images without objects%s: %s%s",
+            *(root, len(names), total, remedy, ", ".join(names[:_MAX_LISTED]), more),
+        )
 
 
 def relative_name(root: Path, path: Path) -> str:

@@ -20,6 +20,7 @@ from mitsplat.detector.labelled_sets.labelled_set import (
     clip_points,
     read_samples,
     relative_name,
+    warn_of_unlabelled,
 )
 from mitsplat.detector.labelled_sets.pictures import SUFFIXES, check_complete, images_below
 from mitsplat.errors import InputError
@@ -112,6 +113,9 @@ def _read_images(
     _check_label_files(images)
     if not any(_label_file(image).is_file() for image in images):
         raise InputError(f"{root}: its images have no labels, such as {_label_file(images[0])}")
+    if kind == "yolo":
+        bare = [relative_name(root, image) for image in images if not _label_file(image).is_file()]
+        warn_of_unlabelled(root, bare, len(images), "; an empty label file confirms it")
 
     def read(image: Path) -> Sample:
         width, height, content = check_complete(image)

@@ -80,6 +80,27 @@ def test_images_without_labels_are_counted(tmp_path: Path, caplog: pytest.LogCap
     assert caplog.messages == []
 
 
+def test_a_missing_folder_of_a_split_is_refused(tmp_path: Path) -> None:
+    """The other folders of the split were read alone."""
+    root = write_yolo(tmp_path / "a", {"train": 2, "val": 1})
+    for train in ("[images/train, images/more]", "[images/more, images/train]"):
+        (root / "data.yaml").write_text(f"train: {train}\nval: images/val\nnames: [disc, box]\n")
+        for split in ("train", "all"):
+            with pytest.raises(
+                InputError, match=rf"data\.yaml: train must name folders or lists .* {root}/images/more\)"
+            ):
+                read_set(root, split)  # type: ignore[arg-type]
+        assert len(read_set(root, "val").samples) == 1
+
+
+def test_a_split_without_a_folder_is_named_if_all_are_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    root = write_yolo(tmp_path / "a", {"train": 2})
+    (root / "data.yaml").write_text("train: images/train\nval: images/vall\nnames: [disc, box]\n")
+    assert len(read_set(root, "all").samples) == 2
+    assert caplog.messages == [f"{root}: there are no images for val in {root}/images/vall"]
+    assert len(read_set(root, "train").samples) == 2 and len(caplog.messages) == 1
+
+
 def test_labels_without_an_image_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     root = yolo(tmp_path / "a", ("a.png", "b.png"), ("a.txt", "c.txt", "d.txt"))
     assert [len(sample.instances) for sample in read_set(root, "train").samples] == [1, 0]

@@ -110,11 +110,13 @@ def _read_images(
     if not images:
         sought = ", ".join(str(root / entry) for name in wanted for entry in listed[name])
         raise InputError(f"{root}: there are no images for {split}" + (_split_counts(root, listed) or f" in {sought}"))
+    if kind == "yolo":
+        _check_entries(root, {name: listed[name] for name in wanted})
     _check_label_files(images)
     if not any(_label_file(image).is_file() for image in images):
         raise InputError(f"{root}: its images have no labels, such as {_label_file(images[0])}")
     if kind == "yolo":
-        bare = [relative_name(root, image) for image in images if not _label_file(image).is_file()]
+        bare = [relative_name(root, one) for one in images if one.is_file() and not _label_file(one).is_file()]
         warn_of_unlabelled(root, bare, len(images), "; an empty label file confirms it")
 
     def read(image: Path) -> Sample:
@@ -134,6 +136,20 @@ def _read_images(
         return Sample(image, relative_name(root, image), width, height, instances, content.hexdigest())
 
     return LabelledSet(root, kind, split, classes, read_samples(read, images, root, progress))
+
+
+def _check_entries(root: Path, listed: dict[str, list[str]]) -> None:
+    """Log a warning for each split of which no folder or list exists; other splits have images.
+
+    Raises:
+        InputError: If only some folders or lists of a split exist.
+    """
+    for name, entries in listed.items():
+        missing = [str(root / entry) for entry in entries if not (root / entry).exists()]
+        if missing and len(missing) < len(entries):
+            raise InputError(f"{root / 'data.yaml'}: {name} must name folders or lists that exist (got {missing[0]})")
+        if missing:
+            _logger.warning("%s: there are no images for %s in %s", root, name, ", ".join(missing))
 
 
 def _check_label_files(images: list[Path]) -> None:

@@ -27,6 +27,13 @@ from mitsplat.renderer.splatting.sorting import stable_order
 FIRST_REFLECTIONS = 2, 6
 """Reflection rays per pixel of a dielectric and of a metal before the error estimate."""
 
+FIRST_ON_BENDS = 12
+"""The same for a pixel of a metal with several sample points.
+
+Few of its neighbours mirror similar directions, so that its own rays determine the variance. With one ray per point,
+they often agree by chance: if all four see a contact shadow, the pixel remains black.
+"""
+
 LEVEL_BITS = 4
 """Bits of the number of doublings; 2^15 times the first rays exceeds every setting."""
 
@@ -267,8 +274,12 @@ class TracedPixels:
             rays = points.ray_count(dr.gather(mi.UInt32, by_pixel, dr.gather(mi.UInt32, points.owner, rows)), rows)
             total.add(rows, tracer.trace(rows, dr.gather(mi.Float, total.rays, rows), rays))
 
-        for_dielectric, for_metal = (min(first, most) if error > 0 else most for first in FIRST_REFLECTIONS)
-        trace(glossy, dr.select(self.here.metallic > 0, dr.opaque(mi.UInt32, for_metal), for_dielectric))
+        for_dielectric, for_metal, on_bends = (
+            dr.opaque(mi.UInt32, min(first, most) if error > 0 else most)
+            for first in (*FIRST_REFLECTIONS, FIRST_ON_BENDS)
+        )
+        on_metal = dr.select(points.slot == UNTRACED, for_metal, on_bends)
+        trace(glossy, dr.select(self.here.metallic > 0, on_metal, for_dielectric))
         sums = points.sums_by_pixel(total)
         if error > 0:
             brightness = typical_brightness(sums.tinted, sums.colourless)

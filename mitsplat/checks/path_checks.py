@@ -111,6 +111,7 @@ def check_asset(asset: Asset) -> Iterator[Finding]:
 
 
 def _asset_findings(asset: Asset) -> Iterator[Finding]:
+    """Yield the findings for splats, units, up axis, mesh, mass and keypoints of an asset."""
     splats = asset.splats
     core = opaque_core(splats).astype(np.float64)
     if not len(core):
@@ -147,6 +148,7 @@ def _up(asset: Asset, core: Float64Array) -> Finding:
 
 
 def _gaussians(asset: Asset, size: float) -> Iterator[Finding]:
+    """Check the shares of long, isolated and invisible Gaussians, for an asset of a ``size`` [m], and its SH degree."""
     splats = asset.splats
     needles = long_needles(splats, size)
     share = float(needles.mean())
@@ -164,6 +166,7 @@ def _gaussians(asset: Asset, size: float) -> Iterator[Finding]:
 
 
 def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
+    """Check that a mesh exists and agrees with the centres ``core`` (N, 3) of opaque Gaussians [m]."""
     mesh = asset.mesh
     if mesh is None:
         remedy = "nothing casts shadows, occludes or supports objects; `mitsplat mesh` creates a mesh"
@@ -228,6 +231,7 @@ def _keypoints(asset: Asset, core: Float64Array) -> Finding:
 
 
 def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
+    """Check the density that follows from the mass of an object and the volume of its mesh."""
     try:
         pieces = asset.pieces or (mesh.convex_hull,)
         solid = closed_solid(mesh, pieces)

@@ -53,6 +53,7 @@ class ContactSheet:
 
 
 def _tile(root: Path, record: Record) -> ByteImage:
+    """Return the picture of a frame with its labels and a caption, RGB (H, W, 3)."""
     image = read_picture_inside(root, image_file(record))
     if image is None:
         raise OSError(f"{root / image_file(record)} cannot be read as an image")

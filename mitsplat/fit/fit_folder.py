@@ -144,6 +144,7 @@ class FitFolder:
             raise InputError(f"{error}; --overwrite replaces it") from error
 
     def _read(self, path: Path) -> FitResult:
+        """Read the record and the splats of a finished fit."""
         record = read_record(path)
         try:
             held_out, validation = (

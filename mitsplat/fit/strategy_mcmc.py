@@ -165,6 +165,10 @@ def jitter(model: GaussianModel, rate: float, seed: Sequence[int]) -> None:
 def _jittered(
     means: mi.Float, scales: mi.Float, quats: mi.Float, opacities: mi.Float, size: mi.Float, seed: mi.UInt32
 ) -> mi.Float:
+    """Return the flat means with the noise of :func:`jitter`, from logarithms of scales and logits of opacities.
+
+    ``size`` is one number, the factor of the noise. ``seed`` has two.
+    """
     i = dr.arange(mi.UInt32, dr.width(opacities))
     sigma = dr.exp(dr.gather(mi.Vector3f, scales, i))
     axes = rotation_axes(dr.normalize(dr.gather(mi.Array4f, quats, i)))

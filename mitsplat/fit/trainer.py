@@ -209,6 +209,7 @@ class _Fit:
         return min(1.0, max(self.steps / s.iterations, spent))
 
     def step(self) -> None:
+        """Fit one photo, and change the number and the positions of Gaussians."""
         s, fraction = self.settings, self.fraction
         epoch, turn = divmod(self.steps, len(self.photos))
         number = int(np.random.default_rng([s.seed, 1, epoch]).permutation(len(self.photos))[turn])

@@ -145,6 +145,7 @@ class _Reader:
             raise InputError(f"{place}: {rule}")
 
     def _read_bytes(self, path: Path) -> bytes:
+        """Read a file within the budget of the scene."""
         if len(self.names) > MAX_INCLUDES:
             raise InputError(f"{self._scene}: must not include more than {MAX_INCLUDES} files")
         try:

@@ -47,6 +47,11 @@ def read_materials(path: Path, count: int) -> SplatMaterials:
 
 
 def _decode(data: bytes, count: int) -> SplatMaterials:
+    """Decode the materials of ``count`` Gaussians, one vertex each.
+
+    Raises:
+        InputError: If the file has another number of vertices, or other properties.
+    """
     form, elements, start = parse_ply_header(data)
     rows, row = elements.get("vertex", (0, np.dtype([])))
     if form == "ascii":

@@ -112,6 +112,7 @@ def _parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
 
 
 def _split(part: trimesh.Trimesh, threshold: float, max_pieces: int) -> list[trimesh.Trimesh]:
+    """Return the convex pieces of a part: its hull, or by planes for closed scans, else by CoACD."""
     hull = part.convex_hull
     if part.is_watertight and part.volume >= _CONVEX * hull.volume:
         return [hull]

@@ -77,6 +77,7 @@ def _try_splats(output: BinaryIO, _: bytes, path: str) -> None:
 
 
 def _read(path: Path, *, warn: bool) -> Splats:
+    """Read the splats of all nodes; with ``warn``, what is left out is logged."""
     data = GltfData(path)
     required = {name for name in data.document.get("extensionsRequired", []) if not name.startswith(_MATERIALS)}
     if unknown := sorted(required - _READ_EXTENSIONS):

@@ -82,6 +82,7 @@ class GltfData:
         return found
 
     def _read_buffer(self, index: int) -> bytes:
+        """Return the bytes of a buffer: the binary chunk, data in the document, or a file."""
         uri = self.entry("buffers", index).get("uri")
         if uri is None:
             if index == 0 and self._binary:
@@ -194,6 +195,7 @@ class GltfData:
         raise InputError(f"a material's texture {index} has no image; give a colour")
 
     def _read_image(self, index: int) -> Image.Image:
+        """Read an image of a texture from a buffer view, a data URI or a file."""
         try:
             stored = self.entry("images", index)
         except ValueError:

@@ -61,6 +61,7 @@ def _painted_lines(lines: list[bytes], colours: bytes) -> list[bytes]:
 
 
 def _plain_line(line: bytes) -> bytes:
+    """Return a line of an OBJ or MTL file without comments and in the spelling that trimesh reads."""
     if b"#" in line:
         key = line.split(maxsplit=1)[0].lower()
         if key.startswith(b"#") or not (key in _NAMES or key.startswith(_KEPT)):

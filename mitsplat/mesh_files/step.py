@@ -156,6 +156,7 @@ def _read_parts(path: Path, glb: bytes) -> MeshFile:
 
 
 def _merge(primitives: list[FilePart]) -> FilePart:
+    """Return the primitives of a part, one per colour, as one part with colours at its face corners."""
     first = primitives[0]
     arrays = [part.vertices for part in primitives], [part.faces for part in primitives]
     vertices, faces = trimesh.util.append_faces(*arrays)

@@ -245,6 +245,7 @@ class _Package:
                     yield self._reference(model, element), _matrix(element.get("transform"))
 
     def _check_root(self, model: str, root: ElementTree.Element, namespaces: Mapping[str, str]) -> None:
+        """Refuse a file that is no 3MF model, requires unknown extensions, or has an unknown unit."""
         if _local(root) != "model":
             raise ValueError(f"{model} is no 3MF model")
         required = {namespaces.get(prefix, prefix) for prefix in root.get("requiredextensions", "").split()}
@@ -266,6 +267,7 @@ class _Package:
         return path.lstrip("/"), element.attrib["objectid"]
 
     def _object(self, model: str, element: ElementTree.Element) -> _Object:
+        """Read an object of a model file, without the faces that a slicer marks as modifiers."""
         vertices, triangles, components = [], [], []
         for child in element.iter():
             kind = _local(child)

@@ -76,6 +76,7 @@ def scene_parts(mesh: trimesh.Trimesh | trimesh.Scene, source: object) -> tuple[
 
 
 def _read_part(name: str, mesh: trimesh.Trimesh, transform: Float64Array) -> FilePart:
+    """Convert a mesh of trimesh and its colours or material; ``transform`` (4, 4) places it in the file."""
     faces, visual = np.asarray(mesh.faces), mesh.visual
     vertices, colours, double_sided = np.asarray(mesh.vertices), None, False
     if isinstance(visual, ColorVisuals):
@@ -117,6 +118,7 @@ def read_material(material: TrimeshMaterial, uv: Float64Array | None = None) -> 
 
 
 def _read_pbr(source: PBRMaterial, uv: Float64Array | None) -> Material:
+    """Convert a metallic-roughness material on faces with texture coordinates (F, 3, 2), or None without any."""
     warnings: list[str] = []
     # trimesh stores linear values as multiples of 1/255.
     factor = np.ones(3) if source.baseColorFactor is None else np.asarray(source.baseColorFactor) / 255.0

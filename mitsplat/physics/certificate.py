@@ -86,6 +86,7 @@ class RestingState:
         return None
 
     def _find_violation(self) -> Defect | None:
+        """Return the first violation: an object leans on an enclosure, touches a scattered one, or fell over."""
         for pair in self._clearances:
             if pair.second.name.startswith(ENCLOSURE) and pair.distance < WALL_DISTANCE:
                 return self._defect(f"{pair.first.name} {LEANING}", pair.first)

@@ -138,6 +138,7 @@ class _Draw:
         self._placed: list[int] = []
 
     def all_poses(self, regions: Sequence[tuple[Region, Arrangement]]) -> Float64Array | None:
+        """Return the poses (N, 4, 4) of all items, or None if an item finds no room."""
         free = []
         for i, item in enumerate(self._items):
             if item.pose is None:

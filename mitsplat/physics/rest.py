@@ -142,6 +142,7 @@ def _run_to_rest(
     redraw: Redraw | None,
     observe: Observe,
 ) -> RestOutcome:
+    """Run :func:`run_to_rest` up to the first rejection, which is raised as ``_Rejected``."""
     mean_frames = max(1, round(_SPEED_WINDOW / world.interval))
     past: deque[Float64Array] = deque([world.poses], maxlen=mean_frames + 1)
     begin, since, rest = handling.end, 0.0, world.poses

@@ -233,6 +233,7 @@ def visible_gpus() -> tuple[Gpu, ...] | MissingPrerequisite:
 
 
 def _gpu(driver: ctypes.CDLL, ordinal: int, unused: Mapping[str, int], *, alone: bool) -> Gpu:
+    """Return the GPU with an index of the driver, and its memory from ``unused`` [bytes], by id."""
     name, bus, number = (ctypes.create_string_buffer(size) for size in (256, 64, 16))
     handle, memory = ctypes.c_int(0), ctypes.c_size_t(0)
     driver.cuDeviceGet(ctypes.byref(handle), ordinal)

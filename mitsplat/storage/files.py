@@ -145,6 +145,7 @@ def open_in_place(path: Path, mode: str) -> IO[Any]:
 
 
 def _open_unlinked(name: str, flags: int) -> int:
+    """Open a regular file that is no link and has no other name; return its descriptor. For ``open(opener=)``."""
     try:
         number = os.open(name, flags & ~os.O_TRUNC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
     except OSError as error:

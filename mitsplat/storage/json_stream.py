@@ -119,6 +119,7 @@ def read_entries(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _read_object(path: Path, *, lists: bool) -> Iterator[tuple[str, Any]]:
+    """Yield the values of an object with their keys; with ``lists``, the elements of its lists one by one."""
     with io.TextIOWrapper(open_regular(path), encoding="utf-8") as file:
         window = _Window(file)
         for _ in _items(window, "{", "}"):

@@ -172,6 +172,15 @@ def find_holes(
 def _hole(
     support: Support, flat: Float64Array, area: float, splats: Splats, cameras: Sequence[tuple[str, Camera]]
 ) -> Hole:
+    """Search for the viewpoint that shows most of a hole, among directions around it.
+
+    Args:
+        support: The support.
+        flat: Centres of the cells of the hole in its frame, shape (N, 2).
+        area: Area of the hole.
+        splats: Splats of the scene.
+        cameras: Names and cameras of the photos.
+    """
     cells, middle = _to_scene(support, flat), _to_scene(support, flat.mean(axis=0)[None])[0]
     centres = np.array([camera.centre for _, camera in cameras])
     distance = float(np.median(np.linalg.norm(centres - middle, axis=1)))

@@ -295,6 +295,7 @@ def _rows(
     factor: float,
     unit: str,
 ) -> dict[str, str]:
+    """Describe the surfaces by name; lengths are multiplied by ``factor`` and stated in ``unit``."""
     first = supports[0]
     rows = {
         "Support": f"{first.size[0]:.3g} x {first.size[1]:.3g} {unit}, {first.filled:.0%} of it visible as flat, "
@@ -354,6 +355,7 @@ def _mean_psnr(views: Sequence[HeldOutView], fitted: Splats | None) -> float:
 def _findings(
     coverage: Coverage, holes: Sequence[Hole], region: Rectangle | None, factor: float, unit: str, *, metric: bool
 ) -> list[str]:
+    """Return a sentence for each defect of the first support; lengths as in :func:`_rows`."""
     found = []
     if coverage.hidden.mean() > _MAX_HIDDEN_SHARE:
         places = "; ".join(_hole_text(hole, factor, unit) for hole in holes) or "in many small parts: add photos"

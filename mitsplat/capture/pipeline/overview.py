@@ -39,6 +39,16 @@ def _panel(
     axes: tuple[int, int],
     reach: float,
 ) -> npt.NDArray[np.uint8]:
+    """Draw points and cameras along two axes, in a square that reaches from -``reach`` to ``reach`` (RGB).
+
+    Args:
+        points: Points (N, 3); the last ones are drawn over the others.
+        colours: Their colours, shape (N, 3).
+        centres: Centres of the cameras, shape (M, 3).
+        ahead: Viewing directions of the cameras, shape (M, 3).
+        axes: Axes of the picture to the right and up.
+        reach: Half of the edge, in the unit of the points.
+    """
     panel = np.full((_PANEL, _PANEL, 3), 255, dtype=np.uint8)
 
     def pixel(place: Float64Array) -> npt.NDArray[np.intp]:

@@ -301,6 +301,7 @@ class Records:
         yield from self._read(self._order[self._indices[self._order] == index])
 
     def _read(self, numbers: npt.NDArray[np.intp]) -> Iterator[Record]:
+        """Yield the readable records of these lines; other lines are violations."""
         with open_regular(self._path) as file:
             end = 0
             for number in map(int, numbers):

@@ -235,6 +235,7 @@ _REMOVED_FIELDS = ("outside", "unseen", "needles", "floaters")
 
 
 def _save_verdict(out: Path, result: Reconstruction, inputs: str) -> None:
+    """Write the verdict of an asset with the hashes of its inputs and of ``asset.yaml``."""
     record: JsonObject = {"inputs": inputs, **asdict(result.verdict), **result.record}
     record[ASSET_FILE] = file_hash(out / ASSET_FILE)
     record["asset_from_capture"] = result.asset_from_capture.tolist()

@@ -36,6 +36,7 @@ def make_primitives(streams: Iterable[np.random.Generator]) -> tuple[Asset, ...]
 
 
 def _make(number: int, rng: np.random.Generator) -> Asset:
+    """Create the primitive of this number, in one or two colours."""
     kind = _KINDS[number % len(_KINDS)]
     mesh = _solid(kind, rng)
     mesh.apply_translation(-mesh.center_mass)

@@ -44,6 +44,7 @@ def lens_warnings(spec: SceneSpec) -> Iterator[Finding]:
 
 
 def _aspect_warnings(lens: Intrinsics, output: tuple[int, int]) -> Iterator[tuple[str, str]]:
+    """Yield a text and the likely cause if the calibrated size has another aspect ratio than the images."""
     if lens.size is None:
         return
     (full_width, full_height), (width, height) = lens.size, output
@@ -66,6 +67,7 @@ def _aspect_warnings(lens: Intrinsics, output: tuple[int, int]) -> Iterator[tupl
 
 
 def _principal_point_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tuple[str, str]]:
+    """Yield a text and the likely cause if the principal point is far from the middle of the image."""
     (width, height), (cx, cy) = full, lens.principal_point(full)
     if abs(cx / width - 0.5) <= CENTRE and abs(cy / height - 0.5) <= CENTRE:
         return
@@ -89,6 +91,7 @@ def _principal_point_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterat
 
 
 def _focal_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tuple[str, str]]:
+    """Yield a text and the likely cause for each implausible field of view or pixel shape."""
     fx, fy = lens.focal_lengths(full)
     fov = lens.fov_x or float(np.degrees(2 * np.arctan(full[0] / (2 * fx))))
     if fov < FOV[0] and lens.fov_x is not None:
@@ -104,6 +107,7 @@ def _focal_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tuple[s
 
 
 def _distortion_warnings(lens: Intrinsics, full: tuple[int, int]) -> Iterator[tuple[str, str]]:
+    """Yield a text and the likely cause if the distortion of the corners or its tangential part is implausible."""
     if lens.is_pinhole:
         return
     corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * full

@@ -259,6 +259,23 @@ def test_a_point_beside_its_proxy_gets_the_light_of_its_neighbours() -> None:
     assert layers.light[seam].min() > 0.3
 
 
+def test_splats_that_hide_the_foot_of_a_wall_have_the_light_of_the_contact() -> None:
+    """Splats of the floor lie above its proxy. At the foot of the wall, half of the sky is visible."""
+    make_integrator()
+    raised = 0.004
+    wall = trimesh.creation.box(bounds=[[0.0, -500, -0.01], [0.5, 500, 0.5]])
+    shapes = {
+        "floor": make_splats_shape(floor(z=raised), proxy=slab()),
+        "wall": make_splats_shape(nothing(), proxy=wall, instance=1),
+        "sky": WHITE_SKY,
+    }
+    camera = Camera.look_at((-1, 0, 0.27), (0, 0, 0), up=(0, 0.2, 1), width=96, height=96, fov_x=4)
+    layers = render(shapes, camera, samples=256, bounce=False)
+    seam = (layers.proxy_instance == 1) & (layers.depth < layers.proxy_depth)
+    assert 300 < seam.sum() < 3000
+    np.testing.assert_allclose(layers.light[seam], 0.5, atol=0.05)
+
+
 def noise_free(shapes: dict[str, Any], camera: Camera, **options: Any) -> Layers:
     return render(shapes, camera, samples=1024, **options)
 

@@ -36,8 +36,8 @@ class LitSurface:
         relit: True if the point is relit (uniform capture), False if it is only shadowed.
         roughness, metallic, specular: Parameters of :class:`mitsplat.renderer.materials.principled.SpecularLobe`.
         captured: True if the colour contains the mirror image of the light of the capture.
-        known: True if the point comes from the proxy of the visible instance; otherwise position and normal are a
-            guess.
+        known: True if the point comes from the proxy of the visible instance, or see :func:`is_raised`; otherwise
+            position and normal are a guess.
         valid: True if there is a point.
     """
 
@@ -145,16 +145,19 @@ class VisibleSurfaces:
         ray, depth, instance = mi.Ray3f(self.eye, seen.direction), seen.depth, seen.instance
         cosine = self.view.cosine(ray)
         met = hit.distance < dr.inf
-        known = ~met | (hit.instance == instance)
         # Splats that are visible through or beside the proxy of a dynamic object lie on a static proxy.
         behind = instance == 0
+        # Raised splats are lit at the object: light changes continuously from the visible proxy beside them.
+        raised = is_raised(instance, depth, hit.instance, hit.distance * cosine)
+        known = ~met | (hit.instance == instance) | raised
         same = dr.select(behind, static.distance < dr.inf, met & known)
-        proxy_depth = dr.select(behind, static.distance, hit.distance) * cosine
+        proxy_depth = dr.select(behind & ~raised, static.distance, hit.distance) * cosine
         shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
         towards = mi.Normal3f(-ray.d)
         # A splat inside its own coarse proxy would lie in the proxy's shadow, so it is lit at the surface of the proxy.
         on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
         z = dr.select(on_proxy, proxy_depth, depth)
+        z = dr.select(raised, z * (1 - 0.25 / self.view.fx), z)  # before the object instead of inside it
         position = ray(z / cosine)
         valid = (seen.alpha > 1 / 255) & (z > 0)
         traits, trait = self.traits, seen.trait
@@ -198,3 +201,16 @@ class VisibleSurfaces:
         cosine = dr.dot(normal, towards)
         normal = dr.select(cosine < MIN_COSINE, dr.normalize(normal + (MIN_COSINE - cosine) * towards), normal)
         return dr.select(dr.squared_norm(seen.normal) > 0, normal, smooth)
+
+
+def is_raised(instance: mi.UInt32, depth: mi.Float, proxy_instance: mi.UInt32, proxy_depth: mi.Float) -> mi.Bool:
+    """Return True for splats of surroundings that rise above their proxy and hide the lower edge of an object.
+
+    Args:
+        instance: Visible instance.
+        depth: Visible depth [m].
+        proxy_instance: Instance of the first proxy.
+        proxy_depth: Depth of the first proxy [m].
+    """
+    close = (depth < proxy_depth) & (depth > (1 - AGREEMENT) * proxy_depth)
+    return (instance == 0) & (proxy_instance > 0) & close

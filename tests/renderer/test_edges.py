@@ -132,6 +132,44 @@ def test_selected_tiles_agree_with_a_slow_count() -> None:
     assert np.array_equal(np.concatenate([np.array(half.number) for half in halves]), np.flatnonzero(flags))
 
 
+def test_marked_pixels_are_sampled_again() -> None:
+    from mitsplat.renderer.instances.antialiasing import Edges
+    from mitsplat.renderer.layers import make_sensor
+    from mitsplat.renderer.rays.sensors import view_of
+
+    view, zoom = view_of(make_sensor(CAMERA)), 2
+    keys = np.zeros((CAMERA.height, CAMERA.width), np.uint32)
+    keys[7:20, 10:31] = 3
+    marked = np.zeros_like(keys, bool)
+    marked[[13, 30, 31, 37], [20, 3, 4, 48]] = True
+    rows, columns = np.nonzero(marked)
+    borders = Edges.find(mi.UInt32(keys.ravel()), view, zoom)
+    edges = Edges.find(mi.UInt32(keys.ravel()), view, zoom, mi.Bool(marked.ravel()))
+    assert borders is not None and edges is not None
+    blocks = rows // (TILE_HEIGHT // zoom) * edges.fine.tiles_x + columns // (TILE_WIDTH // zoom)
+    assert not set(blocks) & set(np.array(borders.subset.number))
+    assert np.array_equal(np.array(edges.subset.number), np.union1d(np.array(borders.subset.number), blocks))
+
+
+def test_light_of_another_surface_is_found_up_to_three_pixels_away() -> None:
+    from mitsplat.renderer.instances.antialiasing import Edges
+    from mitsplat.renderer.layers import make_sensor
+    from mitsplat.renderer.rays.sensors import view_of
+
+    view, border = view_of(make_sensor(CAMERA)), 22
+    column = np.tile(np.arange(CAMERA.width), CAMERA.height)
+    keys = mi.UInt32(np.where(column < border, 1, 2))
+    edges = Edges.find(keys, view, 2, mi.Bool(np.full(column.shape, True)))
+    assert edges is not None
+    pixels = np.array(edges.pixels())
+    found = column[np.array(edges.nearest_other(keys, mi.UInt32(np.array(keys)[pixels])))]
+    here = column[pixels]
+    expected = np.where((here < border) & (here >= border - 3), border, here)
+    expected[(here >= border) & (here < border + 3)] = border - 1
+    assert set(here) == set(range(CAMERA.width))
+    assert np.array_equal(found, expected)
+
+
 def test_a_box_of_tiles_equals_the_same_tiles_selected_singly() -> None:
     from mitsplat.renderer.layers import make_sensor
     from mitsplat.renderer.rays.sensors import view_of

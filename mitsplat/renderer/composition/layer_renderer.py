@@ -23,7 +23,7 @@ from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
 from mitsplat.renderer.instances.silhouettes import PlacedMesh, proxy_silhouettes, splat_silhouettes, with_area_beyond
 from mitsplat.renderer.light.light import light_factor
 from mitsplat.renderer.light.lighting import Accuracy
-from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces
+from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces, is_raised
 from mitsplat.renderer.meshes.mesh_radiance import PathTracer
 from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters
 from mitsplat.renderer.occluders.proxies import Hit
@@ -170,7 +170,8 @@ class LayerRenderer:
         white: mi.Color3f,
     ) -> dict[str, mi.Float | mi.Color3f]:
         """Return colours and opacity with several rays averaged at borders between pixels of different ``key``."""
-        edges = Edges.find(key, view, self.quality.rays_at_borders)
+        raised = is_raised(*(layers[name] for name in ("instance", "depth", "proxy_instance", "proxy_depth")))
+        edges = Edges.find(key, view, self.quality.rays_at_borders, raised)
         if edges is None:
             return {}
         rays = edges.rays()

@@ -2,8 +2,9 @@
 
 One ray through a pixel's centre sees only one side of a silhouette, so that its outline shows steps. The mean of
 several rays times the light of the pixel's centre shows specks where both sides differ in light. Pixels with a
-neighbour of another instance or another visible mesh are therefore rendered again, in a view with one pixel per ray.
-Only the tiles of this view that contain such pixels have lists. The average is taken over linear, lit colours.
+neighbour of another instance or another visible mesh are therefore rendered again, in a view with one pixel per ray. So
+are pixels in which splats of the surroundings hide the lower edge of an object, because they show both. Only the tiles
+of this view that contain such pixels have lists. The average is taken over linear, lit colours.
 
 Light is not traced again. The surface that the pixel shows takes its light. What else a ray sees takes the light of the
 nearest pixel that shows another surface. Both sides of a silhouette are therefore lit like the surface beside them
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import drjit as dr
 import mitsuba as mi
@@ -27,6 +29,13 @@ from mitsplat.renderer.rays.tile_subset import TileSubset
 from mitsplat.renderer.splatting.march import Image, march_tiles
 from mitsplat.renderer.splatting.pairs import CrowdedError
 from mitsplat.renderer.splatting.tiles import bin_gaussians
+
+REACH = 3
+"""Distance up to which the light of another surface is found [px].
+
+Splats of surroundings that rise above their proxy cover the lower edge of an object over several pixels, which show
+both.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,13 +57,14 @@ class Edges:
     zoom: int
 
     @classmethod
-    def find(cls, key: mi.UInt32, view: CameraView, zoom: int) -> Edges | None:
-        """Find the pixels whose ``key`` (UInt32, row-major) differs from one of their eight neighbours.
+    def find(cls, key: mi.UInt32, view: CameraView, zoom: int, mixed: mi.Bool | None = None) -> Edges | None:
+        """Find the blocks of pixels whose ``key`` (UInt32, row-major) differs from one of their eight neighbours.
 
         Args:
             key: Keys of the pixels of the view.
             view: View of the picture.
             zoom: Rays along each axis of a pixel, a divisor of a tile's width and height.
+            mixed: True for other pixels (row-major) that show two surfaces.
 
         Returns:
             None if there are no such pixels.
@@ -65,7 +75,10 @@ class Edges:
         x, y = mi.Int32(block - row * fine.tiles_x) * width, mi.Int32(row) * height
         own, differs = dr.gather(mi.UInt32, key, _pixel(x, y, view)), mi.Bool(False)
         for dx, dy in np.ndindex(width + 2, height + 2):
-            differs |= dr.gather(mi.UInt32, key, _pixel(x + (dx - 1), y + (dy - 1), view)) != own
+            pixel = _pixel(x + (dx - 1), y + (dy - 1), view)
+            differs |= dr.gather(mi.UInt32, key, pixel) != own
+            if mixed is not None and 1 <= dx <= width and 1 <= dy <= height:
+                differs |= dr.gather(mi.Bool, mixed, pixel)
         dr.eval(differs)
         subset = TileSubset.of(differs, fine)
         return cls(view, fine, subset, zoom) if subset.count else None
@@ -104,7 +117,8 @@ class Edges:
     def nearest_other(self, keys: mi.UInt32, own: mi.UInt32) -> mi.UInt32:
         """Return for each ray the nearest pixel with another key than its own pixel; that pixel if there is none.
 
-        If the key of the ray itself is not that of its pixel, only pixels with the key of the ray count.
+        Pixels up to :data:`REACH` away count, in eight directions. If the key of the ray itself is not that of its
+        pixel, only pixels with the key of the ray count.
 
         Args:
             keys: Keys of the picture's pixels.
@@ -116,8 +130,9 @@ class Edges:
         right, down = (dr.select(place % self.zoom * 2 >= self.zoom, mi.Int32(1), -1) for place in (x, y))
         pixel = _pixel(px, py, self.view)
         here, found = dr.gather(mi.UInt32, keys, pixel), mi.Bool(False)
-        for dx, dy in ((1, 0), (0, 1), (1, 1), (-1, 0), (0, -1), (-1, 1), (1, -1), (-1, -1)):
-            other = _pixel(px + dx * right, py + dy * down, self.view)
+        directions = (1, 0), (0, 1), (1, 1), (-1, 0), (0, -1), (-1, 1), (1, -1), (-1, -1)
+        for steps, (dx, dy) in product(range(1, REACH + 1), directions):
+            other = _pixel(px + steps * dx * right, py + steps * dy * down, self.view)
             key = dr.gather(mi.UInt32, keys, other)
             wanted = ~found & (key != here) & ((key == own) | (own == here))
             pixel, found = dr.select(wanted, other, pixel), found | wanted

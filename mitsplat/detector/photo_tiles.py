@@ -39,6 +39,7 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
 
     Raises:
         InputError: If a photograph cannot be read, or its tiles are too small.
+        OSError: If a tile cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     samples = []
@@ -57,7 +58,8 @@ def cut_photographs(photographs: LabelledSet, real_size: int, size: int, folder:
         for top in _tile_starts(sample.height, height):
             for left in _tile_starts(sample.width, width):
                 path = folder / f"{number:05d}_{top}_{left}.jpg"
-                cv2.imwrite(str(path), picture[top : top + height, left : left + width], _JPEG_OPTIONS)
+                _, data = cv2.imencode(".jpg", picture[top : top + height, left : left + width], _JPEG_OPTIONS)
+                path.write_bytes(data.tobytes())  # cv2.imwrite reports no full disk
                 found = (
                     _crop_object(instance, mask, left, top, width, height)
                     for instance, mask in zip(sample.instances, masks, strict=True)

@@ -37,6 +37,15 @@ def test_tiles_show_the_photograph_and_its_labels(tmp_path: Path) -> None:
                 assert instance.box == (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
 
 
+def test_a_tile_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    """cv2.imwrite raises no error on a full disk."""
+    photographs = read_set(write_coco(tmp_path / "photographs", 1), "all")
+    (tmp_path / "tiles").mkdir()
+    (tmp_path / "tiles/00000_21_0.jpg").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left on device"):
+        cut_photographs(photographs, 96, 64, tmp_path / "tiles")
+
+
 def test_boxes_are_cut_with_the_picture(tmp_path: Path) -> None:
     path = tmp_path / "photo.png"
     cv2.imwrite(str(path), np.zeros((100, 300, 3), dtype=np.uint8))

@@ -194,9 +194,9 @@ def compare_with_photographs(
     sides: tuple[_Values, _Values] = defaultdict(list), defaultdict(list)
     hues: tuple[_HueSums, _HueSums] = defaultdict(_zero_hue_sums), defaultdict(_zero_hue_sums)
     for number, sample in enumerate(ours + theirs):
-        if progress is not None:
-            progress(number, len(ours) + len(theirs), "measuring images")
         _measure(sample, number, size, only_boxes, sides[number >= len(ours)], hues[number >= len(ours)])
+        if progress is not None:
+            progress(number + 1, len(ours) + len(theirs), "measuring images")
     least = MIN_RENDERED_OBJECTS, MIN_REAL_OBJECTS
     classes = {
         name: _traits(sides, index)

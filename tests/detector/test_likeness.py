@@ -184,7 +184,11 @@ def test_photographs_of_another_size_are_compared(rendered: Path, photographs: P
 
 
 def test_most_limits_both_image_counts(rendered: Path, photographs: Path) -> None:
-    found = compare_with_photographs([rendered], photographs, size=WIDTH, max_images=7)
+    told: list[tuple[int, int, str]] = []
+    found = compare_with_photographs(
+        [rendered], photographs, size=WIDTH, max_images=7, progress=lambda *step: told.append(step)
+    )
+    assert [step[:2] for step in told] == [(number, 14) for number in range(1, 15)]
     assert (found.images, found.photographs) == (7, 7)
 
 

@@ -252,7 +252,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
     "real classes": (
         _renamed,
         {"real": "other"},
-        r"other: its classes must be those of .*cell: it also has gear \(1 labels\) and it lacks box",
+        r"other: its classes must contain those of .*cell: it lacks box \(its other classes are gear\); rename",
     ),
     "real labels": (
         _gears,
@@ -572,7 +572,7 @@ def test_invalid_evaluation_data_is_refused(data: Path, trained: Run, tmp_path: 
     gears.write_text(gears.read_text().replace("box", "gear"))
     for folder, options, message in (
         ("boxes", {}, "has only boxes"),
-        ("gears", {}, r"gears: its classes must be those of .*run: it also has gear .* and it lacks box"),
+        ("gears", {}, r"gears: its classes must contain those of .*run: it lacks box \(its other classes are gear\)"),
         ("boxes", {"split": "test"}, "there are no images for test"),
         ("boxes", {"size": 100}, r"--size must be a multiple of 32 px \(got 100\)"),
         ("boxes", {"device": "cuda:all"}, "device must be auto, cpu, cuda or cuda:N"),

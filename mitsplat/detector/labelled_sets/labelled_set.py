@@ -166,8 +166,13 @@ def match_classes(found: LabelledSet, class_names: Sequence[str], owner: str) ->
         InputError: If the set lacks a class, because it does not state whether unlabelled objects of this class are
             absent. Also if no label is left.
     """
-    if not set(class_names) <= set(found.class_names):
-        return reorder_classes(found, class_names, owner)
+    if less := sorted(set(class_names) - set(found.class_names)):
+        others = ", ".join(sorted(set(found.class_names) - set(class_names)))
+        raise InputError(
+            f"{found.root}: its classes must contain those of {owner}: it lacks {', '.join(less)}"
+            + (f" (its other classes are {others})" if others else "")
+            + "; rename its classes, or add those that no image shows"
+        )
     chosen = select_classes(found, class_names)
     if chosen.other_labels:
         others = ", ".join(f"{name} ({count} labels)" for name, count in chosen.other_labels.items())

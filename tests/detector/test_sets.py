@@ -551,3 +551,24 @@ def test_a_list_of_cvat_is_followed(tmp_path: Path) -> None:
     (root / "train.txt").write_text("data/images/train/000000.png\ndata/images/train/000001.png\n")
     (root / "data.yaml").write_text("path: .\ntrain: train.txt\nnames:\n  0: disc\n  1: box\n")
     assert len(read_set(root, "train").samples) == 2
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_images_of_12_bits_in_16_are_refused(tmp_path: Path, suffix: str, channels: tuple[int, ...]) -> None:
+    """Ultralytics keeps the upper 8 of 16 bits, so that such an image would be almost black."""
+    values = np.random.default_rng(0).integers(0, 4096, (HEIGHT, WIDTH, *channels), dtype=np.uint16)
+    root = write_yolo(tmp_path, {"train": 1})
+    (root / "images/train/000000.png").unlink()
+    path = root / f"images/train/000000{suffix}"
+    for factor in (1, 16):
+        cv2.imwrite(str(path), values * np.uint16(factor))
+        if factor == 1:
+            with pytest.raises(
+                InputError, match=r"is too dark \(its brightest pixel has 1[56] of 255\): multiply 12-bit"
+            ):
+                read_set(root, "train")
+        else:
+            assert len(read_set(root, "train").samples) == 1
+    cv2.imwrite(str(path), values * np.uint16(0))
+    assert len(read_set(root, "train").samples) == 1  # a covered lens

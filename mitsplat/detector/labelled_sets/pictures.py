@@ -23,6 +23,10 @@ _VERIFIED_FORMATS, _DECODED_FORMATS = ("JPEG", "MPO", "PNG", "WEBP"), ("BMP", "T
 MIN_SIDE = 10
 """Least side of an image that Ultralytics accepts [px]."""
 _JPEG_ENDS = b"\xff\xd9"
+_MIN_BRIGHTEST = 20
+"""Least value of the brightest pixel of a 16-bit image [of 255]; 12-bit values in a file of 16 bits are at most 15."""
+_PNG_DEPTH, _TIFF_DEPTH = 24, 258
+"""Position of the number of bits in a PNG file, and TIFF tag of the numbers of bits."""
 _ORIENTATION, _TRANSPOSED = 274, (5, 6, 7, 8)
 """EXIF orientation tag, which OpenCV applies when it reads an image, and its values that swap width and height."""
 
@@ -80,6 +84,7 @@ def check_complete(path: Path) -> tuple[int, int, ContentHash]:
             width, height = image.size
             turned = image.getexif().get(_ORIENTATION) in _TRANSPOSED
             form = image.format
+            bits = _bits(image, data)
     except IMAGE_ERRORS as error:
         cause = "unknown format" if isinstance(error, UnidentifiedImageError) else error
         raise InputError(f"{path}: cannot be read as an image ({cause})") from error
@@ -91,9 +96,22 @@ def check_complete(path: Path) -> tuple[int, int, ContentHash]:
         width, height = height, width
     if form in _DECODED_FORMATS and _decode(data, path).shape[:2] != (height, width):
         raise InputError(f"{path}: OpenCV must decode it to {width} x {height} px, as Pillow does: save it as PNG")
+    if bits > 8 and 0 < (brightest := int(_decode(data, path).max())) < _MIN_BRIGHTEST:
+        raise InputError(
+            f"{path}: is too dark (its brightest pixel has {brightest} of 255): multiply 12-bit values in files of 16 "
+            "bits by 16"
+        )
     if min(width, height) < MIN_SIDE:
         raise InputError(f"{path}: an image must have sides of {MIN_SIDE} px or more (got {width} x {height})")
     return width, height, ContentHash(data)
+
+
+def _bits(image: Image.Image, data: bytes) -> int:
+    """Return the number of bits of each channel of a PNG or TIFF file, and 8 for other formats."""
+    if image.format == "PNG":
+        return data[_PNG_DEPTH]
+    stated = image.getexif().get(_TIFF_DEPTH, 8) if image.format == "TIFF" else 8
+    return int(max(stated, default=8) if isinstance(stated, tuple) else stated)
 
 
 def _jpeg_end_error(jpeg: bytes) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,24 +11,20 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array, Int64Array
+from mitsplat.gaussians.poisson_disks import PACKING, poisson_subset, query_neighbours
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE
-from mitsplat.runtime.cores import usable_cores
 
 _OPACITY = 0.98
-_PACKING = 0.62
-"""Points per area r^2 in the sets of :func:`poisson_subset`, measured on a plane (0.70 at saturation)."""
 _CANDIDATES = 5.0
 """Candidates per area r^2, sufficient for a nearly maximal set."""
-_NORMAL_WEIGHT = 0.6
-"""Additional distance of points with opposite normals, in units of r. It separates the two sides of thin sheets."""
 _PROBES = 4
 """Points per Gaussian at which the surface is tested for gaps."""
 _MAX_TRANSMITTANCE = 0.02
 """Maximum transmittance between Gaussians at a probe."""
 _CLOSING_ROUNDS = 14
-_ROW_OFFSET, _ROW_SPACING = 0.45, 0.75
-"""Distance of surfel rows from a crease, and of surfels within a row, in units of the local spacing."""
+_ROW_OFFSET = 0.45
+"""Distance of surfel rows from a crease, in units of the local spacing."""
 _CREASE_NEIGHBOURS = 16
 _EDGE_SIGMAS = 1.5
 """Standard deviations of a disc between its centre and the nearest crease."""
@@ -114,7 +109,7 @@ def place_surfels(mesh: trimesh.Trimesh, density: npt.ArrayLike, count: int, rng
     """
     area = mesh.area_faces
     density = np.broadcast_to(np.asarray(density, dtype=np.float64), area.shape)
-    spacing = np.sqrt(_PACKING * (area * density).sum() / count / density)
+    spacing = np.sqrt(PACKING * (area * density).sum() / count / density)
     creases = _CreaseIndex.build(mesh, spacing / 2.0)
     for _ in range(_COUNT_ROUNDS):
         pool = _Pool.draw(mesh, spacing, creases, rng)
@@ -177,7 +172,7 @@ class _Pool:
         if look.any():
             tree = KDTree(points[look])
             bend[look] = _bend(tree, mesh.face_normals[faces[look]], spacing[faces[look]])
-            extra_bend = bend[look][_query(tree, extra[0])[1]]
+            extra_bend = bend[look][query_neighbours(tree, extra[0])[1]]
         near = (extra_distance < spacing[extra[1]]) | (extra_bend > _BEND)
         points = np.concatenate([points, extra[0][near]])
         faces = np.concatenate([faces, extra[1][near]])
@@ -203,7 +198,7 @@ def _uneven_faces(mesh: trimesh.Trimesh, spacing: Float64Array, creases: _Crease
 
 def _bend(tree: KDTree, normals: Float64Array, reach: Float64Array) -> Float64Array:
     """Return the angle [rad], shape (P,), by which the surface bends within ``reach`` (P,) of each tree point."""
-    distance, index = _query(tree, tree.data, k=range(1, 1 + min(10, tree.n)))
+    distance, index = query_neighbours(tree, tree.data, k=range(1, 1 + min(10, tree.n)))
     cosine = np.einsum("pkd,pd->pk", normals[index], normals)
     return np.asarray(np.arccos(np.clip(np.where(distance < reach[:, None], cosine, 1.0).min(axis=1), -1.0, 1.0)))
 
@@ -221,7 +216,7 @@ def _overhang_limit(pool: _Pool, points: Float64Array, frames: Float64Array, sig
             reach = 2.0 * candidate * sigma[undecided] * frames[undecided, :, axis]
             rise = np.zeros(len(undecided))
             for tips in (points[undecided] + reach, points[undecided] - reach):
-                _, nearest = _query(tree, tips)
+                _, nearest = query_neighbours(tree, tips)
                 above = np.einsum("nd,nd->n", tips - pool.points[nearest], pool.normals[nearest])
                 rise = np.maximum(rise, above)
             close = rise < _OVERHANG * sigma[undecided, 0]
@@ -229,69 +224,6 @@ def _overhang_limit(pool: _Pool, points: Float64Array, frames: Float64Array, sig
             undecided = undecided[~close]
         limit[:, axis] = share * sigma[:, 0]
     return limit
-
-
-def poisson_subset(
-    points: Float64Array,
-    normals: Float64Array,
-    radius: Float64Array,
-    rng: np.random.Generator,
-    first: Int64Array | None = None,
-) -> Int64Array:
-    """Return indices of a Poisson-disk subset of ``points`` (N, 3), at least their ``radius`` (N,) apart.
-
-    This is the parallel form of dart throwing (maximal independent set by random priorities, Luby 1986), from small
-    radii to large ones. Opposite ``normals`` (N, 3) count as distance. Points ``first`` (M,) are selected before all
-    others and may be slightly closer together.
-    """
-    if first is not None and len(first):
-        seeds = first[poisson_subset(points[first], normals[first], _ROW_SPACING * radius[first], rng)]
-        chosen = np.zeros(len(points), dtype=bool)
-        chosen[seeds] = True
-        rest = np.flatnonzero(~chosen)
-        gap, nearest = _query(KDTree(points[seeds]), points[rest], distance_upper_bound=float(radius.max()))
-        nearest = seeds[np.minimum(nearest, len(seeds) - 1)]
-        facing = np.einsum("nd,nd->n", normals[rest], normals[nearest]) > 0.7
-        rest = rest[(gap > 0.8 * np.minimum(radius[rest], radius[nearest])) | ~facing]
-        return np.sort(np.concatenate([seeds, rest[poisson_subset(points[rest], normals[rest], radius[rest], rng)]]))
-    level = np.ceil(2.0 * np.log2(radius / radius.min()) - 1e-9).astype(int)
-    kept: list[Int64Array] = []
-    for current in np.unique(level):
-        index = np.flatnonzero(level == current)
-        reach = float(radius[index].max())
-        lifted = np.concatenate([points, _NORMAL_WEIGHT * reach * normals], axis=1)
-        if kept:
-            finer = KDTree(lifted[np.concatenate(kept)])
-            gap, _ = _query(finer, lifted[index], distance_upper_bound=0.85 * reach)
-            index = index[np.isinf(gap)]
-        pairs = KDTree(lifted[index]).query_pairs(reach, output_type="ndarray")
-        kept.append(index[_independent_set(len(index), pairs, rng)])
-    return np.sort(np.concatenate(kept))
-
-
-def _independent_set(count: int, pairs: Int64Array, rng: np.random.Generator) -> BoolArray:
-    """Return a maximal independent set of a graph with ``count`` nodes and edges ``pairs`` (P, 2), as a mask."""
-    priority = rng.permutation(count)
-    alive, chosen = np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
-    while alive.any():
-        dominated = np.zeros(count, dtype=bool)
-        dominated[np.where(priority[pairs[:, 0]] > priority[pairs[:, 1]], pairs[:, 0], pairs[:, 1])] = True
-        winners = alive & ~dominated
-        chosen |= winners
-        alive &= ~winners
-        alive[pairs[winners[pairs[:, 0]], 1]] = False
-        alive[pairs[winners[pairs[:, 1]], 0]] = False
-        pairs = pairs[alive[pairs].all(axis=1)]
-    return chosen
-
-
-def _query(tree: KDTree, points: npt.ArrayLike, **options: Any) -> tuple[Float64Array, Int64Array]:
-    """Return distances and indices of nearest neighbours.
-
-    All cores of the process are used; the result does not depend on their number.
-    """
-    found: tuple[Float64Array, Int64Array] = tree.query(points, workers=usable_cores(), **options)
-    return found
 
 
 def _draw(
@@ -342,7 +274,7 @@ def _close_gaps(
 
     ``scales`` (N, 3) grow up to ``widest`` (N, 2). The transmittance is tested at ``probes`` (P, 3).
     """
-    _, index = _query(KDTree(centres), probes, k=range(1, 1 + min(12, len(centres))))
+    _, index = query_neighbours(KDTree(centres), probes, k=range(1, 1 + min(12, len(centres))))
     own = frames[index]
     local = np.einsum("pkj,pkji->pki", probes[:, None] - centres[index], own[..., :2])
     facing = np.einsum("pkj,pj->pk", own[..., 2], normals) > 0.7
@@ -407,8 +339,10 @@ class _CreaseIndex:
             return near
         local = KDTree(pool.points[near])
         inward, normal = self.inward[self.owner, 0], self.inward[self.owner, 1]
-        spacing = pool.radius[near][_query(local, self.tree.data)[1]]
-        distance, index = _query(local, self.tree.data + offset * spacing[:, None] * inward, k=np.arange(1, 5))
+        spacing = pool.radius[near][query_neighbours(local, self.tree.data)[1]]
+        distance, index = query_neighbours(
+            local, self.tree.data + offset * spacing[:, None] * inward, k=np.arange(1, 5)
+        )
         index = near[np.minimum(index, len(near) - 1)]
         alike = np.einsum("nkd,nd->nk", pool.normals[index], normal) > 0.9
         alike &= distance < 0.4 * spacing[:, None]
@@ -419,7 +353,7 @@ class _CreaseIndex:
         """Return distances (N,) [m] to the nearest crease; infinite beyond ``reach`` [m] or without creases."""
         if self.tree is None:
             return np.full(len(points), np.inf)
-        return np.asarray(_query(self.tree, points, distance_upper_bound=reach)[0])
+        return np.asarray(query_neighbours(self.tree, points, distance_upper_bound=reach)[0])
 
     def offsets(self, points: Float64Array, count: int) -> tuple[Float64Array, BoolArray]:
         """Return vectors (N, ``count``, 3) to the nearest points of the nearest creases; they are long without creases.
@@ -429,7 +363,7 @@ class _CreaseIndex:
         """
         if self.tree is None:
             return np.full((len(points), count, 3), 1e6), np.zeros((len(points), count), dtype=bool)
-        _, index = _query(self.tree, points, k=np.arange(1, count + 1))
+        _, index = query_neighbours(self.tree, points, k=np.arange(1, count + 1))
         segment = self.owner[np.minimum(index, len(self.owner) - 1)]
         from_start = points[:, None] - self.starts[segment]
         position = np.einsum("nkd,nkd->nk", from_start, self.units[segment])

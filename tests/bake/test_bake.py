@@ -16,9 +16,10 @@ from mitsplat.bake.bake import BakeSettings, bake_asset
 from mitsplat.bake.mesh_parts import read_parts
 from mitsplat.bake.part_shapes import UNIFORM_LIGHT, bake_lights, mitsuba_scene
 from mitsplat.errors import InputError
+from mitsplat.gaussians.poisson_disks import poisson_subset
 from mitsplat.gaussians.spherical_harmonics import evaluate_sh
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.gaussians.surfels import place_surfels, poisson_subset
+from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
 from mitsplat.images.colour import encode_srgb

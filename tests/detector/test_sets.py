@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -82,6 +83,23 @@ def test_coco_files_are_chosen_by_split_and_images_found_below(tmp_path: Path) -
     assert len(read_set(root, "val").samples) == 3
     with pytest.raises(InputError, match="must have test in its name"):
         read_set(root, "test")
+
+
+@pytest.mark.parametrize("folder", ["", "images"])
+def test_images_of_one_name_are_found_in_the_folder_of_their_split(tmp_path: Path, folder: str) -> None:
+    (tmp_path / "annotations").mkdir()
+    for number, split in enumerate(("train2017", "val2017")):
+        made = write_coco(tmp_path / "made" / split, 3, first=10 * number)
+        shutil.copytree(made / "photos", tmp_path / folder / split)
+        (made / "labels.json").rename(tmp_path / f"annotations/instances_{split}.json")
+    shutil.rmtree(tmp_path / "made")
+    for number, split in enumerate(("train", "val")):
+        for sample, seed in zip(read_set(tmp_path, split).samples, range(10 * number, 10 * number + 3), strict=True):  # type: ignore[arg-type]
+            np.testing.assert_array_equal(read_upright(sample.path), paint(seed)[0])
+    assert len(read_set(tmp_path, "all").samples) == 6
+    shutil.copytree(tmp_path / folder / "val2017", tmp_path / "more/val")
+    with pytest.raises(InputError, match=r"p0.png must be one image in .* \(got 2\)"):
+        read_set(tmp_path, "val")
 
 
 def test_classes_are_matched_by_name(tmp_path: Path) -> None:

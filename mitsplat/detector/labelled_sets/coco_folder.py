@@ -23,7 +23,7 @@ from mitsplat.detector.labelled_sets.labelled_set import (
 from mitsplat.detector.labelled_sets.pictures import check_complete, images_below
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
-from mitsplat.storage.files import JsonObject, is_inside, read_json
+from mitsplat.storage.files import SPLITS, JsonObject, is_inside, read_json
 
 _MAX_COCO_BYTES = 1 << 32
 """Largest COCO file that is read [bytes]; the file of COCO's 118,287 training images has 0.45e9 bytes."""
@@ -152,6 +152,8 @@ def _image_finder(root: Path, listing: Path) -> Callable[[str], Path]:
     for path in images_below(root):
         below.setdefault(unicodedata.normalize("NFC", path.name), []).append(path)
 
+    own = set(_split_words(listing.relative_to(root))) & set(SPLITS)
+
     def find(name: str) -> Path:
         name = name.replace("\\", "/")  # as Label Studio writes it on Windows
         if not is_inside(root, name):
@@ -165,6 +167,8 @@ def _image_finder(root: Path, listing: Path) -> Callable[[str], Path]:
             for path in below.get(Path(plain).name, ())
             if unicodedata.normalize("NFC", f"/{path}").endswith(f"/{plain}")
         ]
+        if len(found) > 1:  # the folders of splits may hold images of equal names
+            found = [path for path in found if own & set(_split_words(path.relative_to(root).with_name("-")))] or found
         if len(found) != 1:
             raise InputError(f"{listing}: {name} must be one image in {root} (got {len(found)})")
         return found[0]

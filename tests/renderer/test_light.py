@@ -432,6 +432,38 @@ def test_every_kind_of_emitter_gives_the_irradiance_of_its_closed_form() -> None
         assert layers.light.mean() == pytest.approx(irradiance / np.pi, rel=0.01), name
 
 
+@pytest.mark.parametrize("kind", ["point", "rectangle", "sphere"])
+@pytest.mark.parametrize("reverse", [False, True])
+def test_every_lamp_of_a_hall_lights_the_floor_below_it(kind: str, reverse: bool) -> None:
+    """E = sum of I cos(theta) / r^2 at 8 m from the point at which lamps are compared, in any order of the lamps."""
+    make_integrator()
+    place, radius, level = np.array([8.0, 2.0, 0.0]), 0.02, 100.0
+    positions = np.array([[x, y, 1.0] for x in range(-8, 9, 2) for y in (-2, 2)])
+    away = positions - place
+    distance = np.linalg.norm(away, axis=1)
+    cosine = away[:, 2] / distance
+    if kind == "point":
+        lights = [{"type": "point", "position": list(p), "intensity": level} for p in positions]
+        irradiance = (level * cosine / distance**2).sum()
+    else:
+        radiance = {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": level}}}
+        if kind == "rectangle":
+            down = mi.ScalarTransform4f
+            lights = [
+                {"type": "rectangle", "to_world": down().translate(p).scale([radius, radius, -1]), **radiance}
+                for p in positions.tolist()
+            ]
+            irradiance = (level * 4 * radius**2 * cosine**2 / distance**2).sum()
+        else:
+            lights = [{"type": "sphere", "center": list(p), "radius": radius, **radiance} for p in positions]
+            irradiance = (level * np.pi * radius**2 * cosine / distance**2).sum()
+    camera = Camera.look_at(place + np.array([0, 0, 0.5]), place, up=(0, 1, 0), width=16, height=16, fov_x=2)
+    shapes = {"floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20)}}
+    shapes |= {f"lamp{i}": light for i, light in enumerate(lights[::-1] if reverse else lights)}
+    layers = render(shapes, camera, white=np.pi, bounce=False)
+    assert layers.light.mean() == pytest.approx(irradiance / np.pi, rel=0.01)
+
+
 def test_wall_hides_half_of_a_sky() -> None:
     make_integrator()
     wall = trimesh.creation.box(bounds=[[0.0, -5000, 0.0], [0.5, 5000, 5000]])

@@ -23,6 +23,9 @@ SPHERE_LATTICE = (4181, 2584)
 lattices (Niederreiter 1992, section 5.3).
 """
 
+SMALL_LATTICES = ((2, 1), (3, 2), (5, 3), (8, 5), (13, 8), (21, 13))
+"""Lattices of each emitter, if several share the points of one lattice."""
+
 UNIFORM_SHARE = 0.1
 """Share of the rays that is divided equally among all emitters, independent of their light at the reference point."""
 
@@ -75,7 +78,7 @@ class Emitters:
         any_without_extent: True if an emitter is a point or has one direction. All of its rays through regular points
             can hit edges of a proxy.
         choice: Probabilities of the emitters in :meth:`sample`.
-        local_choice: The same without the sky; None if there is no other emitter.
+        local: Indices of the emitters other than the sky, on the host.
         rectangles: Area lights in closed form; None unless all emitters besides the sky are rectangles.
     """
 
@@ -100,8 +103,7 @@ class Emitters:
         self.fluence = dr.opaque(mi.Float, fluence.sum() / 3)
         share = UNIFORM_SHARE / len(emitters) + (1 - UNIFORM_SHARE) * fluence / max(fluence.sum(), 1e-30)
         self.choice = _DiscreteDistribution(share)
-        local = np.where(np.arange(len(emitters)) == sky, 0, share)
-        self.local_choice = _DiscreteDistribution(local) if len(emitters) > len(skies) else None
+        self.local = np.delete(np.arange(len(emitters), dtype=np.uint32), skies)
         self.rectangles = Rectangles.of(emitters, sky)
         self.any_without_extent = any(mi.has_flag(e.flags(), mi.EmitterFlags.Delta) for e in emitters)
         infinite = [mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters]
@@ -226,21 +228,33 @@ class Emitters:
     def unoccluded_irradiance(
         self, si: mi.SurfaceInteraction3f, active: mi.Bool, lattice: tuple[int, int] = OPEN_LATTICE
     ) -> mi.Color3f:
-        """Compute the unoccluded irradiance (Color3f) from one fixed set of directions, those of a ``lattice``."""
+        """Compute the unoccluded irradiance (Color3f) from fixed points of all emitters.
+
+        Emitters share about as many points as a ``lattice`` has, but each has at least a seventh of them. Emitters are
+        not chosen by their light at the reference point, because one that is near the place, but far from that point,
+        would be missed or counted too often.
+        """
         total = mi.Color3f(0)
-        if self.local_choice is not None:
-            choice, rounds = self.local_choice, dr.opaque(mi.UInt32, lattice[0])
+        if len(self.local):
+            least = lattice[0] / min(7, 4 / 3 * len(self.local))
+            number, generator = next((small for small in SMALL_LATTICES if small[0] >= least), lattice)
+            i = np.arange(number)
+            # Tables are faster than divisions in the loop, and do not change the kernel with the number of lamps.
+            indices = wrapped(mi.UInt32, np.repeat(self.local, number))
+            table = np.stack([(i + 0.5) / number, (i * generator % number + 0.5) / number]).astype(np.float32)
+            x, y = (wrapped(mi.Float, np.tile(row, len(self.local))) for row in table)
+            rounds = dr.opaque(mi.UInt32, dr.width(indices))
 
             def add(i: mi.UInt32, total: mi.Color3f) -> tuple[mi.UInt32, mi.Color3f]:
-                point = lattice_point(i, lattice)
-                index, x, chance = choice.sample(point.x)
-                direction, _, radiance, _ = self._towards(si, index, mi.Point2f(x, point.y), active)
+                index = dr.gather(mi.UInt32, indices, i, active)
+                point = mi.Point2f(dr.gather(mi.Float, x, i, active), dr.gather(mi.Float, y, i, active))
+                direction, _, radiance, _ = self._towards(si, index, point, active)
                 cosine = dr.maximum(dr.dot(si.sh_frame.n, direction), 0)
-                return i + 1, total + dr.select(active, radiance * (cosine / chance), 0)
+                return i + 1, total + dr.select(active, radiance * cosine, 0)
 
             state = dr.zeros(mi.UInt32, dr.width(si.p)), dr.zeros(mi.Color3f, dr.width(si.p))
             _, total = dr.while_loop(state, lambda i, _: active & (i < rounds), add, label="open light")
-            total /= lattice[0]
+            total /= dr.opaque(mi.Float, number)
         if self.sky is not None:
             emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
             total += dr.pi * self.sky_colour if self.even_sky else sky_irradiance(emitter).at(si.n, active)

@@ -81,7 +81,7 @@ full = module.asset_from_photos
 def small(*arguments, fit, **options):
     photos, out, job = arguments
     job = replace(job, settings=replace(job.settings, surface=SurfaceSettings(voxels=48, faces=300)))
-    return full(photos, out, job, fit=replace(fit, gaussians=200, iterations=20, size=64), **options)
+    return full(photos, out, job, fit=replace(fit, gaussians=200, iterations=20, max_size=64), **options)
 
 module.asset_from_photos = small
 """,

@@ -62,7 +62,7 @@ def read_mitsplat(root: Path, split: Split, progress: Progress | None) -> Labell
         InputError: As :func:`~mitsplat.detector.labelled_sets.set_reading.read_set`.
     """
     if not (root / "labels").is_dir():
-        raise InputError(f"{root}: training needs YOLO labels: add yolo to output.formats of the scene")
+        raise InputError(f"{root}: detectors need YOLO labels: add yolo to output.formats of the scene")
     described = root / "data.yaml"
     if not described.is_file():
         remedy = "continue its `mitsplat render`, or join its shards with `mitsplat merge`"

@@ -24,7 +24,7 @@ from mitsplat.gaussians.splat_arrays import SplatArrays
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import device_array, make_splats_shape
-from mitsplat.renderer.scene_emitters import MitsubaDict, emitter_dict, movable
+from mitsplat.renderer.scene_emitters import MitsubaDict, emitter_dict, load_emitter
 from mitsplat.renderer.textures import bitmap_texture, finished_mesh, material, texture_image
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt
@@ -130,10 +130,10 @@ class SceneBuilder:
         key = finish, travel, motion.tobytes()
         return self._reuse(name, key, lambda: finished_mesh(mesh, shape, finish, image, bsdf, travel, motion))
 
-    def _emitter(self, light: LightSpec, is_movable: bool) -> mi.Emitter | mi.Shape | MitsubaDict:
-        """Return the emitter of a light, or its Mitsuba dictionary."""
+    def _emitter(self, light: LightSpec, movable: bool) -> mi.Emitter | mi.Shape:
+        """Load the emitter of a light."""
         if not isinstance(light, EnvironmentLight) or light.image is None:
-            return movable(emitter_dict(light)) if is_movable else emitter_dict(light)
+            return load_emitter(emitter_dict(light), movable=movable)
         description = emitter_dict(light.model_copy(update={"image": str(self._scene.images[light.image])}))
         emitter = self._reuse("environment map", description["filename"], lambda: mi.load_dict(description))
         state = mi.traverse(emitter)

@@ -52,21 +52,21 @@ def emitter_dict(light: LightSpec, folder: Path | None = None) -> MitsubaDict:
     }
 
 
-def movable(description: MitsubaDict) -> MitsubaDict | mi.Shape:
-    """Return an emitter whose pose may change in every frame without a new compilation of kernels.
+def load_emitter(description: MitsubaDict, *, movable: bool) -> mi.Emitter | mi.Shape:
+    """Load an emitter; the pose of a movable one may change in every frame without a new compilation of kernels.
 
-    A rectangle is loaded here and its pose made opaque. Its frame is then computed on the device, and may differ in the
-    last bit from a constant in kernels.
+    Mitsuba lists the parts of a scene in arbitrary order if it loads them itself. The order of emitters determines the
+    rays of light. The pose of a movable rectangle is made opaque. Its frame is then computed on the device, and may
+    differ in the last bit from a constant in kernels. The poses of all other emitters are data already.
     """
-    if description["type"] != "rectangle":  # the poses of all other emitters are data already
-        return description
-    shape = mi.load_dict(description)
-    state = mi.traverse(shape)
-    pose = state["to_world"]
-    dr.make_opaque(pose)
-    state["to_world"] = pose
-    state.update()
-    return shape
+    emitter = mi.load_dict(description, parallel=False)
+    if movable and description["type"] == "rectangle":
+        state = mi.traverse(emitter)
+        pose = state["to_world"]
+        dr.make_opaque(pose)
+        state["to_world"] = pose
+        state.update()
+    return emitter
 
 
 def _rgb(value: Float64Array) -> MitsubaDict:

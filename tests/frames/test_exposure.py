@@ -203,3 +203,21 @@ def test_two_coloured_lamps_on_a_white_table_look_as_path_traced() -> None:
     )
     assert np.ptp(expected, axis=(0, 1)).min() > 0.15
     assert np.sqrt(np.mean((seen - expected) ** 2)) < 0.01
+
+
+def test_a_frame_under_many_lamps_is_the_same_whenever_it_is_rendered(
+    scene_data: dict[str, Any], write_scene: WriteScene
+) -> None:
+    """Mitsuba lists the emitters of a scene in arbitrary order if it loads them from one dictionary."""
+    lamps = [
+        {"kind": "area", "position": [0.3 * i - 1, 0.7 - 0.2 * i, 1], "target": [0, 0, 0], "radiance": 3 + i}
+        for i in range(6)
+    ]
+    scene = ms.load_scene(write_scene(scene_data | {"lights": lamps}))
+    assert len({capture_irradiance(scene) for _ in range(12)}) == 1
+    layout = ms.Layout.from_poses(scene, {asset.name: [None] * 4 for asset in scene.assets})
+    pictures = set()
+    for _ in range(4):
+        with ms.Renderer(scene) as renderer:
+            pictures |= {renderer.render(0, layout=layout).rgb.tobytes() for _ in range(2)}
+    assert len(pictures) == 1

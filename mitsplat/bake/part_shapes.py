@@ -16,7 +16,7 @@ from mitsplat.geometry.mesh_normals import corner_normals
 from mitsplat.images.colour import encode_srgb
 from mitsplat.mesh_files.mesh_file import Texture
 from mitsplat.renderer.rays.device_arrays import ray_scene
-from mitsplat.renderer.scene_emitters import MitsubaDict, emitter_dict
+from mitsplat.renderer.scene_emitters import MitsubaDict, emitter_dict, load_emitter
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import LightSpec
 
@@ -120,4 +120,4 @@ def bake_lights(lights: Sequence[LightSpec]) -> MitsubaDict:
     ensure_variant()
     if not lights:
         raise InputError("a scene whose lights are baked needs at least one light (got none)")
-    return {f"light_{k}": emitter_dict(spec) for k, spec in enumerate(lights)}
+    return {f"light_{k}": load_emitter(emitter_dict(spec), movable=False) for k, spec in enumerate(lights)}

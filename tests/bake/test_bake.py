@@ -399,3 +399,13 @@ def test_picture_of_few_samples_is_no_darker_than_one_of_many() -> None:
     camera = Camera.look_at((0, -0.3, 0.5), (0, 0, 0), width=40, height=30, fov_x=30)
     few, many = (render_mesh(scene, camera, samples=samples)[0].mean() for samples in (16, 1024))
     assert few == pytest.approx(many, rel=0.02)
+
+
+def test_baked_lights_keep_their_order() -> None:
+    """Mitsuba lists emitters that it loads from one dictionary in arbitrary order, and paths depend on the order."""
+    lamps = [AreaLight(position=(0.2 * i, 0, 1), target=(0.2 * i, 0, 0), radiance=1.0) for i in range(8)]
+    plane = read_parts(trimesh.creation.box((1, 1, 0.1)))
+    for _ in range(6):
+        scene = mitsuba_scene(plane, bake_lights(lamps))
+        found = [float(np.ravel(emitter.get_shape().bbox().center())[0]) for emitter in scene.emitters()]
+        np.testing.assert_allclose(found, 0.2 * np.arange(8), atol=1e-6)

@@ -225,3 +225,12 @@ def test_the_hash_of_lights_contains_their_values(tmp_path: Path) -> None:
     assert bright.content() != CaptureLight((EnvironmentLight(radiance=1.0),), tmp_path).content()
     with pytest.raises(InputError, match="must be fixed"):
         CaptureLight((EnvironmentLight(draw=LightDraw(radiance=(1, 2))),))
+
+
+def test_lights_of_a_capture_keep_their_order() -> None:
+    """Mitsuba lists emitters that it loads from one dictionary in arbitrary order, and paths depend on the order."""
+    lamps = [AreaLight(position=(0.2 * i, 0, 1), target=(0.2 * i, 0, 0), radiance=1.0) for i in range(8)]
+    for _ in range(6):
+        scene = CaptureLight(tuple(lamps)).scene()
+        found = [float(np.ravel(emitter.get_shape().bbox().center())[0]) for emitter in scene.emitters()]
+        np.testing.assert_allclose(found, 0.2 * np.arange(8), atol=1e-6)

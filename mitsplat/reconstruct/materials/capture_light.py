@@ -12,7 +12,7 @@ from pydantic import Field
 from mitsplat.capture.capture import Capture
 from mitsplat.errors import InputError
 from mitsplat.images.untrusted_images import check_images
-from mitsplat.renderer.scene_emitters import emitter_dict
+from mitsplat.renderer.scene_emitters import emitter_dict, load_emitter
 from mitsplat.scene.spec.light_spec import LightSpec
 from mitsplat.storage.content_hash import file_hash
 from mitsplat.storage.field_types import StrictModel
@@ -67,8 +67,8 @@ class CaptureLight:
 
     def scene(self) -> mi.Scene:
         """Return a Mitsuba scene of the lights."""
-        emitters = {f"light_{number}": emitter_dict(light, self.folder) for number, light in enumerate(self.lights)}
-        return mi.load_dict({"type": "scene", **emitters})
+        emitters = [load_emitter(emitter_dict(light, self.folder), movable=False) for light in self.lights]
+        return mi.load_dict({"type": "scene"} | {f"light_{number}": part for number, part in enumerate(emitters)})
 
     def content(self) -> list[object]:
         """Return the values and the hashes of the images, for the hash of the inputs."""

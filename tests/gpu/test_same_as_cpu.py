@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.conftest import made_once
 from tests.gpu.cases import CASES
 
 SHARE = 5e-4
@@ -22,17 +23,19 @@ DECIBEL = {"path-traced": 45.0}
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory, gpu: None) -> dict[str, dict[str, np.ndarray]]:
     """Render every array of every case, by variant."""
-    folder, found = tmp_path_factory.mktemp("rendered"), {}
-    root = Path(__file__).resolve().parents[2]
-    processes = {}
-    for variant in ("llvm_ad_rgb", "cuda_ad_rgb"):
-        command = [sys.executable, "-m", "tests.gpu.cases", variant, str(folder / f"{variant}.npz")]
-        processes[variant] = subprocess.Popen(command, cwd=root, env=os.environ, stderr=subprocess.PIPE, text=True)
-    for variant, process in processes.items():
-        _, errors = process.communicate()
-        assert process.returncode == 0, errors
-        found[variant] = dict(np.load(folder / f"{variant}.npz"))
-    return found
+    variants, root = ("llvm_ad_rgb", "cuda_ad_rgb"), Path(__file__).resolve().parents[2]
+
+    def make(folder: Path) -> None:
+        processes = []
+        for variant in variants:
+            command = [sys.executable, "-m", "tests.gpu.cases", variant, str(folder / f"{variant}.npz")]
+            processes.append(subprocess.Popen(command, cwd=root, env=os.environ, stderr=subprocess.PIPE, text=True))
+        for process in processes:
+            _, errors = process.communicate()
+            assert process.returncode == 0, errors
+
+    folder = made_once(tmp_path_factory, "gpu_cases", make)
+    return {variant: dict(np.load(folder / f"{variant}.npz")) for variant in variants}
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -10,6 +10,7 @@ Only :mod:`mitsplat.capture.sfm_worker` imports this module, because pycolmap mu
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,8 +21,8 @@ import pycolmap
 
 from mitsplat.arrays import BoolArray
 
-MIN_PHOTOS, MIN_RATIO = 3, 1.05
-"""Minimum number of photos of each lens, and minimum ratio of the focal lengths of two lenses."""
+MAX_LENSES, MIN_PHOTOS, MIN_RATIO = 3, 3, 1.05
+"""Maximum number of lenses, minimum number of photos of each, and minimum ratio of the focal lengths of two lenses."""
 MIN_POINTS = 60
 """Minimum number of points that a photo must observe to determine its focal length within a few per cent."""
 MIN_SEPARATION = 6.0
@@ -59,11 +60,27 @@ def own_focal_lengths(model: pycolmap.Reconstruction) -> Mapping[int, float]:
         apart.add_image_with_trivial_frame(placed, image.cam_from_world())
     for point in model.points3D.values():
         apart.add_point3D(point.xyz, point.track)
+    _adjust(apart)
+    return {index: float(apart.camera(index).mean_focal_length()) for index in apart.reg_image_ids()}
+
+
+def error_of_shifted_lens(model: pycolmap.Reconstruction) -> float:
+    """Return the mean reprojection error [px] after a bundle adjustment that also moves principal points.
+
+    A principal point off the centre, as of cropped photos, also makes the lengths of photos from above differ.
+    """
+    shifted = copy.copy(model)
+    _adjust(shifted, refine_principal_point=True)
+    shifted.update_point_3d_errors()
+    return float(shifted.compute_mean_reprojection_error())
+
+
+def _adjust(model: pycolmap.Reconstruction, *, refine_principal_point: bool = False) -> None:
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_extra_params = options.print_summary = False
+    options.refine_principal_point = refine_principal_point
     options.ceres.solver_options.num_threads = 1  # several threads sum in arbitrary order
-    pycolmap.bundle_adjustment(apart, options)
-    return {index: float(apart.camera(index).mean_focal_length()) for index in apart.reg_image_ids()}
+    pycolmap.bundle_adjustment(model, options)
 
 
 def split_lengths(lengths: npt.ArrayLike, counts: npt.ArrayLike) -> BoolArray:
@@ -100,8 +117,7 @@ def assign_new_camera(database: Path, indices: list[int]) -> None:
         rig.add_ref_sensor(sensor)
         number = opened.write_rig(rig)
         for index in indices:
-            image = images[index]
-            frame = frames[image.frame_id]
+            image, frame = images[index], frames[images[index].frame_id]
             frame.rig_id = number
             frame.clear_data_ids()
             frame.add_data_id(pycolmap.data_t(sensor, index))

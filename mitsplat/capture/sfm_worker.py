@@ -10,6 +10,7 @@ activity.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -26,7 +27,7 @@ zlib.compress(b"before pycolmap")
 import numpy as np  # noqa: E402
 import pycolmap  # noqa: E402
 
-from mitsplat.capture.lens_separation import assign_new_camera, second_lens  # noqa: E402
+from mitsplat.capture.lens_separation import MAX_LENSES, assign_new_camera, error_of_shifted_lens, second_lens  # noqa: E402
 from mitsplat.runtime.child_process import limit_memory  # noqa: E402
 from mitsplat.runtime.cores import usable_cores  # noqa: E402
 
@@ -44,9 +45,6 @@ MAX_TRIALS = 2000
 
 Most of the time of matching is spent on pairs with fewer inliers, because these show no common surface.
 """
-
-MAX_LENSES = 3
-"""Maximum number of lenses that are separated."""
 
 BLOCK = 12
 """Images per block of exhaustive matching; results are stored, and progress is visible, per pair of blocks."""
@@ -226,20 +224,18 @@ def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list
     If photos that share a camera are of lenses with different focal lengths, all models are reconstructed again with a
     camera for each lens.
     """
-    models, separated = find_models(images, database, folder, "models", enough), database
+    models, separated = find_models(images, database, folder, "models", enough), folder / "lenses.db"
+    shutil.copyfile(database, separated)
     for number in range(1, MAX_LENSES):
         if not (models and (longer := second_lens(models[0]))):
             break
-        trial = folder / f"lens{number}.db"
-        shutil.copyfile(separated, trial)
-        assign_new_camera(trial, longer)
-        again = find_models(images, trial, folder, f"lens{number}", enough)
-        errors = [found[0].compute_mean_reprojection_error() for found in (again, models) if found]
-        if not again or again[0].num_reg_images() < models[0].num_reg_images() or errors[0] >= errors[1]:
+        assign_new_camera(separated, longer)
+        again = find_models(images, separated, folder, f"lens{number}", enough)
+        is_smaller = not again or again[0].num_reg_images() < models[0].num_reg_images()
+        if is_smaller or again[0].compute_mean_reprojection_error() >= error_of_shifted_lens(models[0]):
             break
-        models, separated = again, trial
-    for trial in folder.glob("lens?.db"):
-        trial.unlink()
+        models = again
+    separated.unlink()
     return models
 
 
@@ -249,18 +245,14 @@ def find_models(images: Path, database: Path, folder: Path, name: str, enough: i
     The incremental mapper is used. The global mapper is used if it registers more photos.
     """
     write_status(folder, "finding cameras")
-    options = mapping()
-    registered = 0
-
-    def count() -> None:
-        nonlocal registered
-        registered += 1
-        write_status(folder, f"finding cameras {registered}")
-
+    registered = itertools.count(1)
     output = folder / name
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir()
-    found = pycolmap.incremental_mapping(database, images, output, options, next_image_callback=count)
+    found = pycolmap.incremental_mapping(
+        *(database, images, output, mapping()),
+        next_image_callback=lambda: write_status(folder, f"finding cameras {next(registered)}"),
+    )
     models = largest_first(found)
     if models and models[0].num_reg_images() >= enough:
         return models
@@ -313,14 +305,10 @@ def known_model(cameras: dict[str, JsonObject], database: Path) -> pycolmap.Reco
         images = [image for image in opened.read_all_images() if image.name in cameras]
         lenses = {
             image.image_id: pycolmap.Camera(
-                model=known["model"],
-                width=known["width"],
-                height=known["height"],
-                params=known["params"],
+                **{key: cameras[image.name][key] for key in ("model", "width", "height", "params")},
                 camera_id=image.camera_id,
             )
             for image in images
-            for known in [cameras[image.name]]
         }
         for lens in lenses.values():
             opened.update_camera(lens)
@@ -328,8 +316,7 @@ def known_model(cameras: dict[str, JsonObject], database: Path) -> pycolmap.Reco
         known, camera = cameras[image.name], lenses[image.image_id]
         model.add_camera_with_trivial_rig(camera)
         placed = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
-        pose = np.array(known["camera_from_world"])
-        model.add_image_with_trivial_frame(placed, pycolmap.Rigid3d(pose))
+        model.add_image_with_trivial_frame(placed, pycolmap.Rigid3d(np.array(known["camera_from_world"])))
     return model
 
 

@@ -56,6 +56,26 @@ def test_focal_lengths_of_one_lens_are_not_split() -> None:
     assert sum(map(any, split(*cases))) <= 9
 
 
+@pytest.mark.parametrize(
+    ("case", "lengths", "largest"),
+    [
+        ({"offset": (25, 20), "ratio": 1}, [1000], 0.03),
+        ({"offset": (0, 0), "ratio": 1.1}, [1000, 1100], 0.002),
+    ],
+    ids=["principal point off the centre", "two lenses"],
+)
+def test_photos_from_above_with_an_offset_principal_point_are_of_one_lens(
+    case: dict[str, object], lengths: list[float], largest: float, tmp_path: Path
+) -> None:
+    """The offset makes the lengths of photos from above longer; a lens of their own places them off by 8 %."""
+    command = [sys.executable, "-m", "tests.capture.simulated_matches", str(tmp_path), json.dumps(case)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["photos"] == 20
+    assert found["lengths"] == pytest.approx(lengths, rel=0.02)
+    assert found["error"] < largest
+
+
 @pytest.mark.slow
 def test_photos_of_two_lenses_in_one_folder_get_their_own_intrinsics(
     photos: tuple[Path, dict[str, Camera]], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -45,12 +45,13 @@ def strewn(index: int, assets: list[int]) -> Layout:
 def compiled(renderer: Renderer, index: int, layout: Layout) -> tuple[int, int]:
     """Count the kernels that a frame runs, and those not run by any earlier frame.
 
-    All objects are in view, and none reaches the camera's plane: such rare views need a few kernels of their own.
+    All objects are in view, and none reaches the camera's plane: such rare views need a few kernels of their own. The
+    focal length differs between frames.
     """
     plan = plan_frame(renderer.scene, index)
     azimuth = np.radians(180 + 37 * index % 220)  # in the scene's range of azimuths, not from behind the wall
     eye = 0.4 * np.cos(azimuth), 0.4 * np.sin(azimuth) - 0.08, 0.5
-    camera = Camera.look_at(eye, (0, -0.08, 0), width=96, height=54, fov_x=50)
+    camera = Camera.look_at(eye, (0, -0.08, 0), width=96, height=54, fov_x=50 - index / 10)
     dr.kernel_history_clear()
     scene = mi.load_dict(renderer.scene_builder.describe(layout, plan.lights))
     render_layers(renderer.integrator, scene, camera, seed=plan.seed)

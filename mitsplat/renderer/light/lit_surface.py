@@ -157,7 +157,8 @@ class VisibleSurfaces:
         # A splat inside its own coarse proxy would lie in the proxy's shadow, so it is lit at the surface of the proxy.
         on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
         z = dr.select(on_proxy, proxy_depth, depth)
-        z = dr.select(raised, z * (1 - 0.25 / self.view.fx), z)  # before the object instead of inside it
+        quarter = dr.opaque(mi.Float, 0.25 / self.view.fx)  # of a pixel, at a depth of 1
+        z = dr.select(raised, z * (1 - quarter), z)  # before the object instead of inside it
         position = ray(z / cosine)
         valid = (seen.alpha > 1 / 255) & (z > 0)
         traits, trait = self.traits, seen.trait
@@ -179,7 +180,7 @@ class VisibleSurfaces:
             face=mi.Vector3f(dr.select(same, shown[1], towards)),
             lift=dr.select(on_proxy, shown[2], 0),
             to_camera=-ray.d,
-            offset=dr.fma(z, 0.25 / self.view.fx, reach * 4e-6),
+            offset=dr.fma(z, quarter, reach * 4e-6),
             instance=mi.Float(instance),
             trait=mi.Float(trait),
             relit=dr.gather(mi.Bool, traits.relit, trait) | seen.mesh,

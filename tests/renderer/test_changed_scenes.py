@@ -235,25 +235,31 @@ def test_shapes_that_would_be_rendered_wrongly_are_refused_in_one_sentence(
     assert str(error.value) == f"integrator 'splat_proxy': {sentence}"
 
 
-def test_surfaces_without_material_are_invisible() -> None:
-    """The material `null` changes no light: there is neither a shadow nor a depth."""
-    box = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.6), "bsdf": {"type": "null"}}
-    sensor = {
-        "type": "perspective",
-        "to_world": mi.ScalarTransform4f().look_at(origin=[0, -1.2, 1], target=[0, 0, 0], up=[0, 0, 1]),
-        "film": {"type": "hdrfilm", "width": 24, "height": 16},
-    }
+@pytest.mark.parametrize("sky", [False, True])
+def test_surfaces_without_material_are_invisible(sky: bool) -> None:
+    """The material `null` changes no light: there is no shadow and no depth, and lamps and the sky behind it shine."""
     ensure_variant()
+    at = mi.ScalarTransform4f()
+    box = {"type": "cube", "to_world": at.scale(0.6), "bsdf": {"type": "null"}}
+    lamp_pose = at.look_at(origin=[0.1, 1, 0.9], target=[0, 0, 0], up=[0, 0, 1]).scale(0.1)
     shared = {
         "type": "scene",
-        "sensor": sensor,
+        "sensor": {
+            "type": "perspective",
+            "to_world": at.look_at(origin=[0, -1.2, 1], target=[0, 0, 0.3], up=[0, 0, 1]),
+            "fov": 60,
+            "film": {"type": "hdrfilm", "width": 24, "height": 16},
+        },
         "floor": make_splats_shape(floor(), proxy=slab()),
-        "table": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 0.1]).scale(0.1)},
+        "table": {"type": "rectangle", "to_world": at.translate([0, 0, 0.1]).scale(0.1)},
+        "ball": {"type": "sphere", "center": [0.3, 0, 0.3], "radius": 0.2, "bsdf": {"type": "roughplastic"}},
         "lamp": {"type": "point", "position": [0.4, 0.5, 1], "intensity": 1.0},
     }
+    if sky:
+        shared |= {"panel": {"type": "rectangle", "to_world": lamp_pose, "emitter": {"type": "area"}}, "sky": WHITE_SKY}
     with_box, without = (
-        np.array(make_integrator(shadow_error=0, shadow_samples=16).render(mi.load_dict(shared | box_or_none)))
-        for box_or_none in ({"box": box}, {})
+        np.array(make_integrator(shadow_error=0, shadow_samples=16).render(mi.load_dict(shared | more, parallel=False)))
+        for more in ({"box": box}, {})
     )
     np.testing.assert_array_equal(with_box, without)
 

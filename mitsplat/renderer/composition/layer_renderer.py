@@ -25,7 +25,7 @@ from mitsplat.renderer.light.light import light_factor
 from mitsplat.renderer.light.lighting import Accuracy
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces, is_raised
 from mitsplat.renderer.meshes.mesh_radiance import PathTracer
-from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters
+from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters, without_invisible_shapes
 from mitsplat.renderer.occluders.proxies import Hit
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import segments
@@ -70,6 +70,7 @@ class LayerRenderer:
         if the quality has no estimate.
         """
         contents = self._contents.read(scene, self.occluders == "splats")
+        scene = without_invisible_shapes(scene)
         views = view_of(sensor).apertures(self.quality.lens_rings)
         accuracy = Accuracy(self.shadow_error, self.shadow_samples, self.metered)
         paths = -(-self.mesh_samples // len(views))

@@ -42,6 +42,19 @@ def is_null(bsdf: mi.BSDF) -> bool:
     return (int(bsdf.flags()) & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
 
 
+def without_invisible_shapes(scene: mi.Scene) -> mi.Scene:
+    """Return a scene without the shapes that change no light, which rays would hit; that scene if it has none.
+
+    The order of the emitters stays the same.
+    """
+    emitters, shapes = scene.emitters(), [s for s in scene.shapes() if not s.is_emitter()]
+    visible = [s for s in shapes if not is_null(s.bsdf())]
+    if len(visible) == len(shapes):
+        return scene
+    lights = [e.get_shape() if mi.has_flag(e.flags(), mi.EmitterFlags.Surface) else e for e in emitters]
+    return ray_scene({f"part_{i}": part for i, part in enumerate([*lights, *visible])})
+
+
 def is_transmissive(bsdf: mi.BSDF) -> bool:
     """Return True if light passes through a material, which then casts no shadow on splats and diffuse meshes."""
     return bool(has_bsdf_flag(int(bsdf.flags()), "GlossyTransmission", "DeltaTransmission")) or "ThinDielectric" in str(

@@ -120,7 +120,9 @@ class OpenCVCamera(mi.Sensor):
         at = mi.Point2f(film.crop_offset()) + position * mi.Vector2f(film.crop_size())
         u, v = self.view().slopes(at.x, at.y)
         ray = dr.zeros(mi.Ray3f, dr.width(position))
-        to_world = mi.Transform4f(mi.Matrix4f(self.world_from_mitsuba.tolist()))
+        matrix = mi.Matrix4f(self.world_from_mitsuba.tolist())
+        dr.make_opaque(matrix)  # another pose reuses the compiled kernels
+        to_world = mi.Transform4f(matrix)
         radius, focus = self.thin_lens
         point = radius * mi.warp.square_to_uniform_disk_concentric(aperture) if radius else mi.Point2f(0)
         ray.o = to_world @ mi.Point3f(point.x, point.y, 0)

@@ -46,3 +46,19 @@ def test_pixels_have_the_rays_of_other_integrators(parameters: dict[str, Any], c
     cosine = np.array(dr.dot(ray.d, view.rays().d))
     assert cosine.min() == pytest.approx(1, abs=1e-6)
     np.testing.assert_allclose(np.array(ray.d), np.array(view.rays().d), atol=1e-5)
+
+
+def test_other_integrators_compile_no_new_kernels_for_a_moved_camera() -> None:
+    sensor = sensor_of(False, **OPENCV)
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "cube": {"type": "cube"}})
+    parameters = mi.traverse(sensor)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for number in range(3):
+            parameters["to_world"] = mi.Transform4f().look_at([0.1 * number, -3, 1.5], [0, 0, 0], [0, 0, 1])
+            parameters.update()
+            dr.kernel_history_clear()
+            dr.eval(mi.render(scene, sensor=sensor, spp=2))
+            run = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+            new = sum(not entry["cache_hit"] or entry["cache_disk"] for entry in run)
+            assert run
+            assert number == 0 or new == 0

@@ -165,7 +165,8 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
     with storage_errors(Path(tempfile.gettempdir())), tempfile.TemporaryDirectory() as folder:
         names = checked.write(Path(folder))
         try:
-            scene = mi.load_file(str(next(iter(names))))
+            # The optimisation lists parts in arbitrary order, on which the noise of the light depends.
+            scene = mi.load_file(str(next(iter(names))), optimize=False)
             image = np.array(_render(path, scene))
         except RuntimeError as error:
             raise InputError(describe_error(path, str(error), names)) from error

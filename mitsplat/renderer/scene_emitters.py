@@ -55,9 +55,9 @@ def emitter_dict(light: LightSpec, folder: Path | None = None) -> MitsubaDict:
 def load_emitter(description: MitsubaDict, *, movable: bool) -> mi.Emitter | mi.Shape:
     """Load an emitter; the pose of a movable one may change in every frame without a new compilation of kernels.
 
-    Mitsuba lists the parts of a scene in arbitrary order if it loads them itself. The order of emitters determines the
-    rays of light. The pose of a movable rectangle is made opaque. Its frame is then computed on the device, and may
-    differ in the last bit from a constant in kernels. The poses of all other emitters are data already.
+    By default, Mitsuba lists the parts of a scene in arbitrary order if it loads them itself. The order of emitters
+    determines the rays of light. The pose of a movable rectangle is made opaque. Its frame is then computed on the
+    device, and may differ in the last bit from a constant in kernels. The poses of all other emitters are data already.
     """
     emitter = mi.load_dict(description, parallel=False)
     if movable and description["type"] == "rectangle":

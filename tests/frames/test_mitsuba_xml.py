@@ -250,6 +250,20 @@ def test_a_scene_with_includes_renders_as_mitsuba_renders_it(tmp_path: Path) -> 
     np.testing.assert_allclose(ours, others, rtol=1e-5 if mi.variant().startswith("cuda") else 0)
 
 
+def test_a_scene_with_many_lamps_gives_the_same_picture_again(small: Path) -> None:
+    """By default, Mitsuba lists the parts of a file in arbitrary order, on which the noise of the light depends."""
+    lamp = """<shape type="rectangle">
+        <transform name="to_world"> <lookat origin="{}, {}, 1" target="0, 0, 0" up="0, 0, 1"/> </transform>
+        <emitter type="area"> <rgb name="radiance" value="{}"/> </emitter>
+    </shape>"""
+    lamps = [lamp.format(0.3 * i - 1, 0.7 - 0.2 * i, 3 + i) for i in range(6)]
+    ball = '<float name="radius" value="0.01"/> <bsdf type="roughconductor"/>'
+    table = f'<shape type="rectangle"/> <shape type="sphere"> {ball} </shape>'
+    scene = write(small, SCENE.format("\n".join([NUT.format('<integer name="instance" value="1"/>'), table, *lamps])))
+    pictures = {render_xml(scene, small / f"{i}.exr").read_bytes() for i in range(4)}
+    assert len(pictures) == 1
+
+
 def test_an_error_in_an_included_file_names_its_line(small: Path) -> None:
     (small / "parts").mkdir()
     (small / "parts/more.xml").write_text(

@@ -85,6 +85,20 @@ def test_coco_files_are_chosen_by_split_and_images_found_below(tmp_path: Path) -
         read_set(root, "test")
 
 
+def test_a_supercategory_that_one_coco_file_labels_is_a_class_of_all(tmp_path: Path) -> None:
+    for split, first in (("train", 10), ("val", 20)):
+        path = write_coco(tmp_path / split, 3, first=first) / "labels.json"
+        labels = json.loads(path.read_text())
+        labels["categories"] = [one | {"supercategory": "part"} for one in labels["categories"]]
+        labels["categories"].append({"id": 70, "name": "part"})
+        if split == "train":
+            labels["annotations"].append(labels["annotations"][0] | {"id": 70, "category_id": 70})
+        path.write_text(json.dumps(labels))
+    found = read_set(tmp_path, "all")
+    assert found.class_names == ("box", "disc", "part") and len(found.samples) == 6
+    assert read_set(tmp_path, "val").class_names == ("box", "disc")
+
+
 @pytest.mark.parametrize("folder", ["", "images"])
 def test_images_of_one_name_are_found_in_the_folder_of_their_split(tmp_path: Path, folder: str) -> None:
     (tmp_path / "annotations").mkdir()

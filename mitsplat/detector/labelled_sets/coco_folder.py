@@ -40,7 +40,9 @@ def read_coco(root: Path, split: Split, progress: Progress | None) -> LabelledSe
     Raises:
         InputError: As :func:`~mitsplat.detector.labelled_sets.set_reading.read_set`.
     """
-    parts = [_coco_part(root, split, *file, progress) for file in _coco_files(root, split).items()]
+    files = _coco_files(root, split)
+    labelled = set[str]().union(*map(_labelled_categories, files.values()))
+    parts = [_coco_part(root, split, labelled, *file, progress) for file in files.items()]
     parts = [reorder_classes(part, parts[0].class_names, str(root)) for part in parts]
     samples = tuple(sample for part in parts for sample in part.samples)
     twice = [name for name, count in Counter(sample.name for sample in samples).items() if count > 1]
@@ -49,14 +51,24 @@ def read_coco(root: Path, split: Split, progress: Progress | None) -> LabelledSe
     return replace(parts[0], samples=samples)
 
 
-def _coco_part(root: Path, split: Split, path: Path, content: JsonObject, progress: Progress | None) -> LabelledSet:
-    """Return the labelled images of one COCO file."""
+def _labelled_categories(content: JsonObject) -> set[str]:
+    """Return the names of the categories that have labels; none if the content is no COCO dataset."""
     try:
         used = {annotation["category_id"] for annotation in content["annotations"]}
+        return {category["name"] for category in content["categories"] if category["id"] in used}
+    except (KeyError, TypeError):
+        return set()
+
+
+def _coco_part(
+    root: Path, split: Split, labelled: set[str], path: Path, content: JsonObject, progress: Progress | None
+) -> LabelledSet:
+    """Return the labelled images of one COCO file; ``labelled`` are the categories with labels in any file."""
+    try:
         above = {c["name"]: c.get("supercategory") for c in content["categories"]}
         parents = {parent for name, parent in above.items() if parent != name and above.get(parent) != parent}
         unlabelled = parents | _BACKGROUND
-        categories = [c for c in content["categories"] if c["id"] in used or c["name"] not in unlabelled]
+        categories = [c for c in content["categories"] if c["name"] in labelled or c["name"] not in unlabelled]
         categories.sort(key=lambda category: category["id"])
         names = tuple(str(category["name"]) for category in categories)
         index = {category["id"]: i for i, category in enumerate(categories)}

@@ -254,7 +254,7 @@ def test_rendering_on_the_cpu_has_a_lower_priority_than_training(tmp_path, capsy
 @pytest.mark.extended
 def test_labels_of_workshop_photographs_are_the_visible_pixels(tmp_path, physics, monkeypatch):
     monkeypatch.setattr(record, "_open", [{}])
-    options = argparse.Namespace(work=tmp_path, scenes=2, views=1, width=160, samples=4)
+    options = argparse.Namespace(work=tmp_path, first=0, scenes=2, photos="photos", views=1, width=160, samples=4)
     workshop.photograph_workshops(options)
     labels = json.loads((tmp_path / "photos/labels.json").read_text())
     assert [image["file_name"] for image in labels["images"]] == ["scene_0000_0000.jpg", "scene_0001_0000.jpg"]

@@ -49,6 +49,36 @@ def test_sampled_directions_and_light_equal_those_of_mitsuba() -> None:
     assert 0.2 < np.mean(np.array(light)[0] > 0) < 0.8
 
 
+def test_irradiance_equals_the_sum_over_many_points_of_mitsuba() -> None:
+    """Places lie on all sides of the lamps, and many lamps cross the horizon of a place."""
+    tiny = lamp((3.0, -4.0, 5.0), (0.002, 0.004, 1.0))
+    close = lamp((0.0, 0.1, 0.3), (1.0, 0.8, 1.0))
+    for lamps in ({"tiny": tiny}, {"close": close}, LAMPS):
+        scene = mi.load_dict({"type": "scene", **lamps})
+        emitters = scene.emitters()
+        sky = next((i for i, emitter in enumerate(emitters) if emitter.is_environment()), None)
+        table = Rectangles.of(emitters, sky)
+        assert table is not None
+        rng, count, grid = np.random.default_rng(2), 60, 256
+        normals = rng.normal(size=(3, count))
+        normals /= np.linalg.norm(normals, axis=0)
+        places = mi.Point3f(rng.uniform(-1, 1, (3, count)).astype(np.float32))
+        found = np.array(table.irradiance(places, mi.Vector3f(normals.astype(np.float32)), mi.Bool(True)))
+        lane = dr.arange(mi.UInt32, count * grid * grid)
+        row, cell = lane // (grid * grid), lane % (grid * grid)
+        point = mi.Point2f(mi.Float(cell % grid) + 0.5, mi.Float(cell // grid) + 0.5) / grid
+        normal = dr.gather(mi.Vector3f, mi.Vector3f(normals.astype(np.float32)), row)
+        si = receiver(dr.gather(mi.Point3f, places, row), normal)
+        expected = np.zeros((3, count))
+        for i, emitter in enumerate(emitters):
+            if i != sky:
+                sample, radiance = emitter.sample_direction(si, point, True)
+                light = np.array(radiance * dr.maximum(dr.dot(normal, sample.d), 0), np.float64)
+                expected += light.reshape(3, count, -1).mean(axis=2)
+        assert 0.2 < np.mean(expected[0] > 0) < 0.9
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=2e-5 * expected.max())
+
+
 @pytest.mark.parametrize(
     "other",
     [

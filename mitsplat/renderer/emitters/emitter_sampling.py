@@ -228,14 +228,16 @@ class Emitters:
     def unoccluded_irradiance(
         self, si: mi.SurfaceInteraction3f, active: mi.Bool, lattice: tuple[int, int] = OPEN_LATTICE
     ) -> mi.Color3f:
-        """Compute the unoccluded irradiance (Color3f) from fixed points of all emitters.
+        """Compute the unoccluded irradiance (Color3f), in closed form if the emitters are rectangles.
 
-        Emitters share about as many points as a ``lattice`` has, but each has at least a seventh of them. Emitters are
-        not chosen by their light at the reference point, because one that is near the place, but far from that point,
-        would be missed or counted too often.
+        Otherwise it is the light of fixed points of all emitters. Emitters share about as many points as a ``lattice``
+        has, but each has at least a seventh of them. Emitters are not chosen by their light at the reference point,
+        because one that is near the place, but far from that point, would be missed or counted too often.
         """
         total = mi.Color3f(0)
-        if len(self.local):
+        if self.rectangles is not None:
+            total = self.rectangles.irradiance(si.p, mi.Vector3f(si.sh_frame.n), active)
+        elif len(self.local):
             least = lattice[0] / min(7, 4 / 3 * len(self.local))
             number, generator = next((small for small in SMALL_LATTICES if small[0] >= least), lattice)
             i = np.arange(number)

@@ -342,8 +342,8 @@ def test_workers_select_the_device_first(monkeypatch):
 @pytest.mark.parametrize(("workers", "threads"), [(2, 3), pytest.param(4, 2, marks=pytest.mark.extended)])
 def test_workers_share_the_cores(monkeypatch, workers, threads):
     monkeypatch.setattr(engine, "usable_cores", lambda: 6)
-    with closing(run_frames(Threads(), {0: range(2)}, workers=workers, note=print, device=CPU)) as results:
-        assert list(results) == [(threads, 1), (threads, 1)]
+    with closing(run_frames(Threads(), {0: range(workers)}, workers=workers, note=print, device=CPU)) as results:
+        assert list(results) == [(threads, 1)] * workers
 
 
 def test_a_missing_gpu_is_reported_in_one_sentence():

@@ -96,28 +96,32 @@ def refine_pose(
     training = [view for view in boundaries if view not in validation]
     outlines = MeshOutlines(mesh)
     limits = np.array([_MAX_TURN] * 3 + [_MAX_SHIFT] * 3 + [_MAX_GROWTH] * (not rigid))
-    turned = [replace(frame, start=start) for start in _turns(mesh)]
+    turns = _turns(mesh)
     few = training[:: -(-len(training) // _FEW_VIEWS)]
 
     def report_progress(number: int) -> None:
         if progress is not None:
-            progress(number, len(turned) + 2, "refining the pose of the mesh")
+            progress(number, 2 * len(turns) + 2, "refining the pose of the mesh")
 
     before = _overlaps(validation, outlines, np.eye(4))
     motion, misfit = _solve(training, outlines, frame, limits, _ROUNDS)
     after = _overlaps(validation, outlines, motion)
     kept = is_gain(after - before)
     report_progress(1)
-    misfits = []
-    for number, start in enumerate(turned):
-        misfits.append(_solve(few, outlines, start, limits, _FEW_ROUNDS)[1])
-        report_progress(2 + number)
-    if turned:
-        turned_motion, turned_misfit = _solve(training, outlines, turned[np.argmin(misfits)], limits, _ROUNDS)
+    turned, least, number = frame, np.inf, 1
+    for _ in range(2):  # a prism has turns about its axis in either direction of this axis
+        for start in [replace(turned, start=turned.start @ turn) for turn in turns]:
+            distance = _solve(few, outlines, start, limits, _FEW_ROUNDS)[1]
+            if distance < least:
+                turned, least = start, distance
+            number += 1
+            report_progress(number)
+    if turns:
+        turned_motion, turned_misfit = _solve(training, outlines, turned, limits, _ROUNDS)
         overlaps = _overlaps(validation, outlines, turned_motion)
         if turned_misfit < _TURN_MISFIT * misfit and is_gain(overlaps - (after if kept else before), _TURN_GAIN):
             motion, after, kept = turned_motion, overlaps, True
-    report_progress(len(turned) + 2)
+    report_progress(2 * len(turns) + 2)
     motion = motion if kept else np.eye(4)
     return RefinedPose(kept, float(before.mean()), float(after.mean()), len(validation), motion=motion)
 

@@ -53,8 +53,7 @@ def own_focal_lengths(model: pycolmap.Reconstruction) -> Mapping[int, float]:
     apart = pycolmap.Reconstruction()
     for index in model.reg_image_ids():
         image = model.image(index)
-        lens = pycolmap.Camera(model.camera(image.camera_id).todict() | {"camera_id": index})
-        apart.add_camera_with_trivial_rig(lens)
+        apart.add_camera_with_trivial_rig(pycolmap.Camera(image.camera.todict() | {"camera_id": index}))
         pixels = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
         placed = pycolmap.Image(name=image.name, keypoints=pixels, camera_id=index, image_id=index)
         apart.add_image_with_trivial_frame(placed, image.cam_from_world())

@@ -225,17 +225,18 @@ def reconstruct(images: Path, database: Path, folder: Path, enough: int) -> list
     camera for each lens.
     """
     models, separated = find_models(images, database, folder, "models", enough), folder / "lenses.db"
-    shutil.copyfile(database, separated)
     for number in range(1, MAX_LENSES):
         if not (models and (longer := second_lens(models[0]))):
             break
+        if number == 1:
+            shutil.copyfile(database, separated)
         assign_new_camera(separated, longer)
         again = find_models(images, separated, folder, f"lens{number}", enough)
         is_smaller = not again or again[0].num_reg_images() < models[0].num_reg_images()
         if is_smaller or again[0].compute_mean_reprojection_error() >= error_of_shifted_lens(models[0]):
             break
         models = again
-    separated.unlink()
+    separated.unlink(missing_ok=True)
     return models
 
 

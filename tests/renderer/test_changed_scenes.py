@@ -18,6 +18,16 @@ from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_light import WHITE_SKY, floor, nothing, slab
 
 
+def perspective(target: list[float], width: int, height: int) -> dict[str, Any]:
+    """Describe a camera before and above a target."""
+    return {
+        "type": "perspective",
+        "fov": 50,
+        "to_world": mi.ScalarTransform4f().look_at(origin=[0, -1.2, 1], target=target, up=[0, 0, 1]),
+        "film": {"type": "hdrfilm", "width": width, "height": height},
+    }
+
+
 def make_scene() -> Any:
     """Build a captured floor with an object, a table, a block, and a visible lamp."""
     ensure_variant()
@@ -26,12 +36,7 @@ def make_scene() -> Any:
     return mi.load_dict(
         {
             "type": "scene",
-            "sensor": {
-                "type": "perspective",
-                "fov": 50,
-                "to_world": at.look_at(origin=[0, -1.2, 1], target=[0, 0, 0], up=[0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": 32, "height": 24},
-            },
+            "sensor": perspective([0, 0, 0], 32, 24),
             "floor": make_splats_shape(floor(), proxy=slab()),
             "part": make_splats_shape(floor(0.1, 0.8, 0.2), proxy=slab(0.1, 0.2), instance=1),
             "table": {
@@ -109,18 +114,12 @@ def test_splats_that_are_moved_equal_splats_that_are_loaded_there(instance: int,
     """Splats, their colours, proxy, shadow and ids move, for surroundings and for one of two equal objects."""
     ensure_variant()
     splats, proxy = textured_box(), trimesh.creation.box((0.4, 0.24, 0.16))
-    at = mi.ScalarTransform4f()
 
     def scene_of(pose: Any) -> Any:
         return mi.load_dict(
             {
                 "type": "scene",
-                "sensor": {
-                    "type": "perspective",
-                    "fov": 50,
-                    "to_world": at.look_at(origin=[0, -1.2, 1], target=[0, 0, 0.1], up=[0, 0, 1]),
-                    "film": {"type": "hdrfilm", "width": 48, "height": 36},
-                },
+                "sensor": perspective([0, 0, 0.1], 48, 36),
                 "table": {"type": "rectangle"},
                 "other": make_splats_shape(splats, np.array(turned(20, 0.3).matrix), proxy, instance=1),
                 "part": make_splats_shape(splats, np.array(pose.matrix), proxy, instance=instance),

@@ -50,17 +50,17 @@ def second_lens(model: pycolmap.Reconstruction) -> list[int]:
 
 def own_focal_lengths(model: pycolmap.Reconstruction) -> Mapping[int, float]:
     """Return the focal length [px] of each photo after a bundle adjustment with one focal length per photo."""
-    apart = pycolmap.Reconstruction()
+    own = pycolmap.Reconstruction()
     for index in model.reg_image_ids():
         image = model.image(index)
-        apart.add_camera_with_trivial_rig(pycolmap.Camera(image.camera.todict() | {"camera_id": index}))
+        own.add_camera_with_trivial_rig(pycolmap.Camera(model.camera(image.camera_id).todict() | {"camera_id": index}))
         pixels = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
         placed = pycolmap.Image(name=image.name, keypoints=pixels, camera_id=index, image_id=index)
-        apart.add_image_with_trivial_frame(placed, image.cam_from_world())
+        own.add_image_with_trivial_frame(placed, image.cam_from_world())
     for point in model.points3D.values():
-        apart.add_point3D(point.xyz, point.track)
-    _adjust(apart)
-    return {index: float(apart.camera(index).mean_focal_length()) for index in apart.reg_image_ids()}
+        own.add_point3D(point.xyz, point.track)
+    _adjust(own)
+    return {index: float(own.camera(index).mean_focal_length()) for index in own.reg_image_ids()}
 
 
 def error_of_shifted_lens(model: pycolmap.Reconstruction) -> float:

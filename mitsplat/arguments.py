@@ -40,6 +40,12 @@ def list_in_words(words: Sequence[str], last: Literal["and", "or"]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
+def list_first(words: Sequence[str], most: int) -> str:
+    """Return the first words as a list, and the number of the others: "a, b and 5 more"."""
+    others = f" and {len(words) - most} more" if len(words) > most else ""
+    return f"{', '.join(words[:most])}{others}"
+
+
 def path_of(value: object, place: str) -> Path:
     """Return an argument of the Python API as a path.
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from mitsplat.arguments import list_first
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.capture.capture import Capture
 from mitsplat.geometry.camera import Camera
@@ -43,10 +44,8 @@ def find_causes(capture: Capture, pictures: Pictures) -> dict[str, str]:
             found.setdefault(name, []).append(cause)
 
     if blurred := blurred_photos([photo.name for photo in capture.photos], pictures):
-        named = ", ".join(blurred[:_MAX_NAMES]) + (
-            f" and {len(blurred) - _MAX_NAMES} more" if len(blurred) > _MAX_NAMES else ""
-        )
-        add_cause(f"{len(blurred)} of {len(pictures)} photos are less than half as sharp as most ({named})", "psnr")
+        names = list_first(blurred, _MAX_NAMES)
+        add_cause(f"{len(blurred)} of {len(pictures)} photos are less than half as sharp as most ({names})", "psnr")
     if capture.up == "z" and (gaps := missing_views(views_from([photo.camera for photo in capture.photos]))):
         add_cause(f"no photo is from {'; from '.join(gaps)}", "mesh_iou", "watertight")
     own = masked_points(capture, pictures)

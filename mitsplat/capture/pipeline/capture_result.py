@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mitsplat.arguments import list_first
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import MIN_REGISTERED
 from mitsplat.capture.structure_from_motion import MIN_POINTS
@@ -75,10 +76,10 @@ class CaptureResult:
         warnings = [] if self.video is None else [*self.video.warnings]
         if self.unnamed:
             text = f"the poses do not name {len(self.unnamed)} pictures in the folder, which are left out"
-            warnings.append(f"{text}: {_first_of(self.unnamed)}")
+            warnings.append(f"{text}: {list_first(self.unnamed, _MAX_LISTED)}")
         if self.copies:
             text = f"{len(self.copies)} of the files are copies of other photos and are left out"
-            warnings.append(f"{text}: {_first_of(self.copies)}")
+            warnings.append(f"{text}: {list_first(self.copies, _MAX_LISTED)}")
         if self.doubtful:
             shares = ", ".join(f"{name} ({share:.0%})" for name, share in sorted(self.doubtful.items()))
             warnings.append(
@@ -103,9 +104,3 @@ class CaptureResult:
             f"{MIN_REGISTERED:.0%} are required: take sharp photos of one object at steps of about ten degrees, with "
             "texture below it and even light"
         )
-
-
-def _first_of(names: Sequence[str]) -> str:
-    """List the first names and the number of the others."""
-    others = f" and {more} more" if (more := len(names) - _MAX_LISTED) > 0 else ""
-    return f"{', '.join(names[:_MAX_LISTED])}{others}"

@@ -8,6 +8,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
+from mitsplat.arguments import list_first
 from mitsplat.errors import InputError
 from mitsplat.progress import Progress
 from mitsplat.runtime.child_process import python_command, python_environment
@@ -48,10 +49,9 @@ class ChosenFrames:
         """Warnings about the video, one sentence each."""
         if not self.cuts:
             return ()
-        times = ", ".join(f"{time:.1f} s" for time in self.cuts[:_MAX_LISTED_CUTS])
-        more = f" and {len(self.cuts) - _MAX_LISTED_CUTS} more times" if len(self.cuts) > _MAX_LISTED_CUTS else ""
+        times = list_first([f"{time:.1f} s" for time in self.cuts], _MAX_LISTED_CUTS)
         return (
-            f"{self.video}: jumps at {times}{more}, by a cut or a movement too fast to track: parts without common "
+            f"{self.video}: jumps at {times}, by a cut or a movement too fast to track: parts without common "
             "views with the rest have no cameras",
         )
 

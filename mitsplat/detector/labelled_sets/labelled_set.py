@@ -12,6 +12,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from pycocotools import mask as coco_mask
 
+from mitsplat.arguments import list_first
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.images.masks import decode_rle, encode_mask
@@ -261,10 +262,9 @@ def read_samples(
 def warn_of_unlabelled(root: Path, names: Sequence[str], total: int, remedy: str = "") -> None:
     """Log a warning if some of ``total`` images have no labels; ``names`` are those of these images."""
     if names:
-        more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
         _logger.warning(
-            "%s: %d of %d images have no labels and count as images without objects%s: %s%s",
-            *(root, len(names), total, remedy, ", ".join(names[:_MAX_LISTED]), more),
+            "%s: %d of %d images have no labels and count as images without objects%s: %s",
+            *(root, len(names), total, remedy, list_first(names, _MAX_LISTED)),
         )
 
 

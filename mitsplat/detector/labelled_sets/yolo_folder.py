@@ -12,6 +12,7 @@ import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from mitsplat.arguments import list_first
 from mitsplat.detector.labelled_sets.labelled_set import (
     LabelledObject,
     LabelledSet,
@@ -172,10 +173,8 @@ def _check_label_files(images: list[Path]) -> None:
                     "form of its letters)"
                 )
         if alone:
-            more = f" and {len(alone) - 1} more" if len(alone) > 1 else ""
-            _logger.warning(
-                "%s: %s%s are not used, because %s has no image of these names", labels, alone[0].name, more, pictures
-            )
+            names = list_first([path.name for path in alone], 1)
+            _logger.warning("%s: %s are not used, because %s has no image of these names", labels, names, pictures)
 
 
 def _plain(name: str) -> str:

@@ -263,6 +263,64 @@ def test_surfaces_without_material_are_invisible(sky: bool) -> None:
     np.testing.assert_array_equal(with_box, without)
 
 
+def make_scene_in_a_box() -> Any:
+    """Build a scene inside a box of the material `null`, with lamps of three kinds."""
+    ensure_variant()
+    at = mi.ScalarTransform4f()
+    pose = at.look_at(origin=[0.1, 1, 0.9], target=[0, 0, 0], up=[0, 0, 1]).scale(0.1)
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": perspective([0, 0, 0.1], 24, 16),
+            "box": {"type": "cube", "to_world": at.scale(0.6), "bsdf": {"type": "null"}},
+            "floor": make_splats_shape(floor(), proxy=slab()),
+            "ball": {
+                "type": "sphere",
+                "to_world": at.translate([0.3, 0, 0.3]).scale(0.2),
+                "bsdf": {"type": "roughplastic"},
+            },
+            "lamp": {"type": "point", "position": [0.4, 0.5, 1], "intensity": 1.0},
+            "panel": {"type": "rectangle", "to_world": pose, "emitter": {"type": "area", "radiance": 10.0}},
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
+        },
+        parallel=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("ball.to_world", moved),
+        ("floor.to_world", moved),
+        ("lamp.position", lambda point: point + mi.Point3f(-0.6, 0, 0.2)),
+        ("lamp.intensity.value", lambda intensity: intensity * 4),
+        ("panel.to_world", moved),
+        ("panel.emitter.radiance.value", lambda radiance: radiance * 4),
+        ("sky.radiance.value", lambda radiance: radiance * 4),
+    ],
+)
+def test_parameters_of_a_scene_with_invisible_shapes_change_the_image(key: str, change: Callable[[Any], Any]) -> None:
+    scene, integrator = make_scene_in_a_box(), make_integrator(shadow_samples=16, shadow_error=0)
+    before = [np.array(integrator.render(scene)) for _ in range(2)][-1]
+    parameters = mi.traverse(scene)
+    parameters[key] = change(type(parameters[key])(parameters[key]))
+    parameters.update()
+    after = np.array(integrator.render(scene))
+    assert np.abs(after - before).max() > 0.01
+    truth = make_integrator(shadow_samples=16, shadow_error=0).render(scene)
+    np.testing.assert_array_equal(after, np.array(truth))
+
+
+def test_the_scene_without_invisible_shapes_is_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, integrator = make_scene_in_a_box(), make_integrator(shadow_samples=4)
+    integrator.render(scene)
+    loaded = []
+    load = mi.load_dict
+    monkeypatch.setattr(mi, "load_dict", lambda *args, **options: loaded.append(args) or load(*args, **options))
+    integrator.render(scene)
+    assert not loaded
+
+
 @pytest.mark.parametrize("name", ["bsdf", "interior"])
 def test_splats_with_a_material_or_medium_are_refused(name: str) -> None:
     """They would have no effect."""

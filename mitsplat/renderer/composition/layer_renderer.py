@@ -25,10 +25,10 @@ from mitsplat.renderer.light.light import light_factor
 from mitsplat.renderer.light.lighting import Accuracy
 from mitsplat.renderer.light.lit_surface import VisiblePixels, VisibleSurfaces, is_raised
 from mitsplat.renderer.meshes.mesh_radiance import PathTracer
-from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters, without_invisible_shapes
+from mitsplat.renderer.meshes.visible_meshes import MeshHits, VisibleEmitters, visible_parts
 from mitsplat.renderer.occluders.proxies import Hit
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.rays.device_arrays import segments
+from mitsplat.renderer.rays.device_arrays import ray_scene, segments
 from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.renderer.splatting.march import Image, largest_and_mean, trace
 from mitsplat.renderer.splatting.pairs import CrowdedError
@@ -60,6 +60,7 @@ class LayerRenderer:
     sky_reach: float
     reference: tuple[float, ...]
     _contents: ContentsReader = field(default_factory=ContentsReader, init=False, repr=False)
+    _visible_scene: tuple[ShapeState, mi.Scene] | None = field(default=None, init=False, repr=False)
     _static_tiles: tuple[_CacheKey, StaticTileCache | None] | None = field(default=None, init=False, repr=False)
 
     def render_layers(self, scene: mi.Scene, sensor: mi.Sensor, *, seed: int = 0) -> dict[str, dr.ArrayBase]:
@@ -70,7 +71,7 @@ class LayerRenderer:
         if the quality has no estimate.
         """
         contents = self._contents.read(scene, self.occluders == "splats")
-        scene = without_invisible_shapes(scene)
+        scene = self._without_invisible_shapes(scene)
         views = view_of(sensor).apertures(self.quality.lens_rings)
         accuracy = Accuracy(self.shadow_error, self.shadow_samples, self.metered)
         paths = -(-self.mesh_samples // len(views))
@@ -92,6 +93,16 @@ class LayerRenderer:
             layers["order_error"] = dr.concat([reduce(dr.maximum, [e[0] for e in errors]), sum(e[1] for e in errors)])
             layers["order_error"] /= mi.Float([1, len(views)])
         return layers
+
+    def _without_invisible_shapes(self, scene: mi.Scene) -> mi.Scene:
+        """Return a scene without shapes that change no light; it is reused while its shapes and emitters stay."""
+        parts = visible_parts(scene)
+        if parts is None:
+            return scene
+        if self._visible_scene is None or not self._visible_scene[0].holds_for(parts):
+            visible = ray_scene({f"part_{i}": part for i, part in enumerate(parts)})
+            self._visible_scene = ShapeState.of(parts), visible
+        return self._visible_scene[1]
 
     def _layers(
         self, contents: SceneContents, scene: mi.Scene, view: CameraView, accuracy: Accuracy, paths: int, seed: int

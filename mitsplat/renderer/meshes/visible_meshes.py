@@ -42,17 +42,17 @@ def is_null(bsdf: mi.BSDF) -> bool:
     return (int(bsdf.flags()) & int(mi.BSDFFlags.All)) == int(mi.BSDFFlags.Null)
 
 
-def without_invisible_shapes(scene: mi.Scene) -> mi.Scene:
-    """Return a scene without the shapes that change no light, which rays would hit; that scene if it has none.
+def visible_parts(scene: mi.Scene) -> list[mi.Shape | mi.Emitter] | None:
+    """Return emitters, in their order, and the shapes that change light; None if all shapes of the scene do.
 
-    The order of the emitters stays the same.
+    Rays would hit the other shapes.
     """
     emitters, shapes = scene.emitters(), [s for s in scene.shapes() if not s.is_emitter()]
     visible = [s for s in shapes if not is_null(s.bsdf())]
     if len(visible) == len(shapes):
-        return scene
+        return None
     lights = [e.get_shape() if mi.has_flag(e.flags(), mi.EmitterFlags.Surface) else e for e in emitters]
-    return ray_scene({f"part_{i}": part for i, part in enumerate([*lights, *visible])})
+    return [*lights, *visible]
 
 
 def is_transmissive(bsdf: mi.BSDF) -> bool:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from mitsplat.errors import InputError
 
 _Class = TypeVar("_Class")
+_Number = TypeVar("_Number", int, float)
 
 
 def check_type(value: object, kind: type, place: str, remedy: str) -> None:
@@ -44,6 +45,17 @@ def list_first(words: Sequence[str], most: int) -> str:
     """Return the first words as a list, and the number of the others: "a, b and 5 more"."""
     others = f" and {len(words) - most} more" if len(words) > most else ""
     return f"{', '.join(words[:most])}{others}"
+
+
+def number_from(text: str, kind: type[_Number]) -> _Number:
+    """Return ``kind(text)``, but refuse the digits of other scripts and the separators that Python permits.
+
+    Raises:
+        ValueError: If the text is no such number.
+    """
+    if not text.isascii() or "_" in text:
+        raise ValueError(f"must be a number (got {text})")
+    return kind(text)
 
 
 def path_of(value: object, place: str) -> Path:

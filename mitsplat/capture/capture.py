@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from mitsplat.arguments import checks_arguments
+from mitsplat.arguments import checks_arguments, number_from
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int32Array
 from mitsplat.capture.capture_spec import CaptureSpec, PhotoCamera, PhotoSpec
 from mitsplat.errors import InputError
@@ -180,7 +180,7 @@ def parse_pixel(text: str, place: str) -> tuple[float, float]:
         InputError: If it is no such text. The message begins with ``place``.
     """
     try:
-        x, y = map(float, text.split(","))
+        x, y = (number_from(part, float) for part in text.split(","))
     except ValueError:
         raise InputError(f"{place}: a pixel must be given as X,Y (got {text})") from None
     return x, y

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeVar, get_args, get_type_hints
 
 import typer
 
-from mitsplat.arguments import list_in_words
+from mitsplat.arguments import list_in_words, number_from
 from mitsplat.errors import InputError
 from mitsplat.quality import PresetName
 
@@ -94,11 +94,9 @@ def parse_number(text: str | float) -> float:
 
 
 def _parse_as(kind: type[_Number], text: str, rule: str) -> _Number:
-    """Return ``kind(text)``, but refuse the digits of other scripts and the separators that Python permits."""
+    """Return the number that a text states; raise BadParameter with ``rule`` if there is none."""
     try:
-        if not text.isascii() or "_" in text:
-            raise ValueError
-        return kind(text)
+        return number_from(text, kind)
     except ValueError:
         raise typer.BadParameter(f"must be {rule} (got {text})") from None
 

@@ -36,7 +36,7 @@ STRIDE = 32
 MIN_TORCH = "2.6"
 """First PyTorch release that lists the classes of a file before it loads it; the safe loader needs this."""
 
-_DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,2})?")
+_DEVICE = re.compile(r"auto|cpu|cuda(:[0-9]{1,2})?")
 
 
 def check_device(device: str) -> None:

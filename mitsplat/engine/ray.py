@@ -18,6 +18,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
+from mitsplat.arguments import number_from
 from mitsplat.engine.answers import Answer, Failure, Finished, Lost, LostWorkersError, Result
 from mitsplat.engine.pool import check_workers
 from mitsplat.engine.scheduler import run_pool
@@ -79,7 +80,7 @@ class Cluster:
         for part in text.split(","):
             name, _, amount = part.strip().partition("=")
             try:
-                found[name] = float(amount)
+                found[name] = number_from(amount, float)
             except ValueError:
                 found[name] = 0.0
             if not name or not 0 < found[name] < float("inf"):

@@ -25,6 +25,14 @@ def top_of(thing: int) -> np.ndarray:
     return np.array([x, y, 0.07 + float(ground(np.array([[x, y]]))[0])])
 
 
+@pytest.mark.parametrize("pixel", ["1_0,20", "٣,20", "10", "10,20,30", "10,x", ""])
+def test_a_pixel_is_read_as_it_is_written(capture: Capture, pixel: str) -> None:
+    name = capture.photos[0].name
+    with pytest.raises(InputError) as error:
+        capture.picked(f"{name}:{pixel}")
+    assert str(error.value) == f"{name}:{pixel}: a pixel must be given as X,Y (got {pixel})"
+
+
 @pytest.mark.parametrize("thing", [0, 1, 2])
 def test_a_ray_picks_the_object_that_it_hits(capture: Capture, thing: int) -> None:
     pick = pick_along(capture, EYE, top_of(thing) - EYE)

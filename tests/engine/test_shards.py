@@ -461,7 +461,7 @@ def refuse_5(scene, index, *, layout):
     return render(scene, index, layout=layout)
 
 
-@pytest.mark.parametrize("text", ["CPU", "CPU=0", "=3", "CPU=x", "CPU=nan", "CPU=2,,"])
+@pytest.mark.parametrize("text", ["CPU", "CPU=0", "=3", "CPU=x", "CPU=nan", "CPU=2,,", "CPU=1_0", "CPU=٣"])
 def test_invalid_resources_are_refused(text):
     with pytest.raises(InputError, match=r"resources must be NAME=AMOUNT"):
         Cluster.parse_resources(text)

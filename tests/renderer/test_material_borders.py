@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import mitsuba as mi
@@ -18,6 +19,8 @@ from mitsplat.renderer.composition import material_borders
 from mitsplat.renderer.composition.scene_contents import ContentsReader
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
 from mitsplat.renderer.materials.proxy_materials import corner_materials, material_triangles
+from mitsplat.renderer.projection import splat_appearance
+from mitsplat.renderer.projection.splat_appearance import DIRT
 
 STEEL, RUBBER = (0.6, 0.6, 0.6), (0.02, 0.02, 0.02)
 STEP, SPACING = 0.05, 0.04
@@ -37,13 +40,13 @@ def _step_mesh() -> trimesh.Trimesh:
     return trimesh.Trimesh(rows.reshape(-1, 3), faces, process=False)
 
 
-def _step_splats() -> Splats:
-    """Return flat Gaussians on both tops: steel for x < 0, rubber for x > 0."""
+def _step_splats(rubber: tuple[float, float, float] = RUBBER) -> Splats:
+    """Return flat Gaussians on both tops: steel for x < 0, rubber of a linear colour for x > 0."""
     along = np.arange(SPACING / 2, 1, SPACING)
     x, y = (part.ravel() for part in np.meshgrid(np.concatenate([-along, along]), np.concatenate([-along, along])))
     metal = x < 0
     count = len(x)
-    colours = encode_srgb(np.where(metal[:, None], STEEL, RUBBER))
+    colours = encode_srgb(np.where(metal[:, None], STEEL, rubber))
     return Splats(
         np.stack([x, y, np.where(metal, STEP, 0.0)], axis=1),
         np.tile([0, 0, 0, 1.0], (count, 1)),
@@ -54,9 +57,14 @@ def _step_splats() -> Splats:
     )
 
 
-def _rendered(splats: Splats | None = None, target: tuple[float, float, float] = (0, 0, 0)) -> Layers:
-    """Return the layers of the step, or of other splats on it, seen in even light from above and the side of steel."""
-    shape = make_splats_shape(splats or _step_splats(), proxy=_step_mesh(), instance=1)
+def _rendered(
+    splats: Splats | None = None, target: tuple[float, float, float] = (0, 0, 0), **properties: object
+) -> Layers:
+    """Return the layers of the step, or of other splats on it, seen in even light from above and the side of steel.
+
+    ``properties`` are those of the shape ``splats``.
+    """
+    shape = make_splats_shape(splats or _step_splats(), proxy=_step_mesh(), instance=1, **properties)
     light = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
     scene = mi.load_dict({"type": "scene", "object": shape, "light": light})
     camera = Camera.look_at((-1.2, 0, 2.6), target, width=96, height=64, fov_x=24)
@@ -101,6 +109,24 @@ def test_the_luminance_of_a_border_is_the_linear_mean_of_its_materials() -> None
     expected = share * STEEL[0] + (1 - share) * RUBBER[0]
     assert np.count_nonzero(border) > 20
     assert layers.captured.mean(axis=2)[border] == pytest.approx(expected[border], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("properties", "factors"),
+    [
+        ({"colours": "0.8 0 0 0 0.9 0 0 0 1"}, (0.8, 0.9, 1.0)),
+        ({"wear": 0.5, "colours": "0.9 0 0 0 0.9 0 0 0 0.9"}, [0.9 * (1 - 0.5 * (1 - dirt)) for dirt in DIRT]),
+    ],
+    ids=["colours", "dirt"],
+)
+def test_an_appearance_changes_borders_like_the_materials_beside_them(
+    properties: dict[str, object], factors: Sequence[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(splat_appearance, "CLEAN", -2.0)  # dirt has its full thickness everywhere
+    monkeypatch.setattr(splat_appearance, "COVERED", -1.0)
+    plain, changed = _rendered(_step_splats((0.2, 0.2, 0.2))), _rendered(_step_splats((0.2, 0.2, 0.2)), **properties)
+    shown = plain.alpha > 0.999
+    assert changed.captured[shown] == pytest.approx(plain.captured[shown] * factors, rel=0.02)
 
 
 def test_an_object_of_several_materials_may_be_outside_of_the_image() -> None:

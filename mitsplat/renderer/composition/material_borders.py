@@ -29,6 +29,7 @@ from mitsplat.renderer.composition.parameter_pass import ParameterPass, paramete
 from mitsplat.renderer.materials.proxy_materials import MIN_OPACITY, GlossChange
 from mitsplat.renderer.occluders.proxies import Hit
 from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, merge_clouds
+from mitsplat.renderer.projection.splat_appearance import SplatAppearance, changed_colours
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH, CameraView
 from mitsplat.renderer.rays.device_arrays import wrapped
 from mitsplat.renderer.rays.tile_subset import TileSubset
@@ -70,10 +71,11 @@ class MixedObjects:
         ]
         if not own:
             return None
-        keys = list({(shape.splats, shape.gloss): None for shape, _ in own})
+        looks = [(shape.splats, shape.gloss, shape.appearance) for shape, _ in own]
+        keys = list(dict.fromkeys(looks))
         placed = [
-            replace(placement, cloud=keys.index((shape.splats, shape.gloss)), appearance=None)
-            for shape, placement in own
+            replace(placement, cloud=keys.index(look), appearance=None)
+            for look, (_, placement) in zip(looks, own, strict=True)
         ]
         mixed = np.zeros(1 + max(shape.instance for shape in shapes), bool)
         mixed[[placement.instance for placement in placed]] = True
@@ -142,12 +144,12 @@ def _is_mixed(splats: Splats) -> bool:
     return len(metallic) > 0 and float(np.ptp(metallic)) > DIFFERENT
 
 
-@lru_cache(maxsize=64)
-def _parameter_cloud(splats: Splats, gloss: GlossChange) -> Cloud:
+@lru_cache(maxsize=16)
+def _parameter_cloud(splats: Splats, gloss: GlossChange, appearance: SplatAppearance | None) -> Cloud:
     """Upload splats with metalness, luminance and roughness, each times the luminance, in place of colours."""
     materials = splats.materials or SplatMaterials.uniform(len(splats))
-    base = np.clip(decode_srgb(0.5 + SH_C0 * splats.sh[:, 0]), 0, 1)
-    luminance = np.maximum(base @ LUMINANCE, LEAST_LUMINANCE)
+    base = decode_srgb(changed_colours(0.5 + SH_C0 * splats.sh[:, 0], appearance, splats.means))
+    luminance = np.maximum(np.clip(base, 0, 1) @ LUMINANCE, LEAST_LUMINANCE)
     roughness = materials.roughness if gloss.roughness is None else np.full(len(splats), gloss.roughness)
     values = luminance[:, None] * np.stack([materials.metallic, np.ones(len(splats)), roughness], axis=1)
     return parameter_cloud(splats, values)

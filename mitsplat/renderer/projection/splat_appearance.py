@@ -18,6 +18,7 @@ import numpy as np
 from mitsplat.arrays import Float32Array
 from mitsplat.renderer.projection.gaussian import linear_to_srgb, srgb_to_linear
 from mitsplat.renderer.projection.records import AppearanceRow
+from mitsplat.renderer.rays.device_arrays import wrapped
 
 CELLS = 3.0
 """Cells of the coarsest noise along the longest side of an object."""
@@ -83,6 +84,16 @@ def apply_appearance(colour: list[mi.Float], row: list[mi.Float], point: mi.Vect
 
     present = row[AppearanceRow.PRESENT] > 0
     return list(dr.if_stmt((colour, row, point), present, change, lambda colour, *_: list(colour), label="appearance"))
+
+
+def changed_colours(colours: Float32Array, appearance: SplatAppearance | None, points: Float32Array) -> Float32Array:
+    """Apply an appearance to display-encoded colours (N, 3) of Gaussians with centres ``points`` (N, 3)."""
+    if appearance is None:
+        return colours
+    columns, centres = (wrapped(mi.Float, np.asarray(values, np.float32)) for values in (colours, points))
+    row = [dr.opaque(mi.Float, value, len(colours)) for value in appearance.row]
+    changed = apply_appearance([*dr.unravel(mi.Color3f, columns)], row, dr.unravel(mi.Vector3f, centres))
+    return np.stack([np.array(channel) for channel in changed], axis=1)
 
 
 def dirt_thickness(point: mi.Vector3f, seed: mi.UInt32) -> mi.Float:

@@ -24,6 +24,7 @@ from mitsplat.geometry.mesh import mass_properties, prepare_mesh
 from mitsplat.geometry.rigid import homogeneous_matrix, split_similarity
 from mitsplat.storage.files import JsonObject
 from mitsplat.usd.stage_physics import Record
+from mitsplat.usd.stage_reader import unread_note
 from mitsplat.usd.stage_records import read_records
 
 _ENCODED = ("", "srgb_rec709_scene", "srgb_rec709_display", "srgb_texture", "sRGB", "auto", "raw")
@@ -72,7 +73,7 @@ def read_stage_asset(path: Path) -> StageAsset:
             f"{path}: must have one object (its splats belong to {len(bodies)} rigid bodies and surroundings)"
         )
     notes += [
-        f"not imported: {len(records[kind])} {kind} ({records[kind][0]['path']}{', ...' if records[kind][1:] else ''})"
+        unread_note(kind, [record["path"] for record in records[kind]])
         for kind in ("cameras", "lights")
         if records[kind]
     ]

@@ -9,7 +9,7 @@ preferred to those of half precision; arrays that are too long are cut, and arra
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,11 @@ _LIGHT_INPUTS = (
 )
 """Inputs of lights that are read; those of dome lights are others."""
 _DOME_INPUTS = ("texture:file", "texture:format")
+
+
+def unread_note(what: str, paths: Sequence[str]) -> str:
+    """Return the note on prims that are not read; ``what`` is a noun phrase in the plural."""
+    return f"not imported: {len(paths)} {what} ({paths[0]}{', ...' if paths[1:] else ''})"
 
 
 class StageReader:
@@ -98,7 +103,7 @@ class StageReader:
         ]
         for what, found_paths in self._ignored.items():
             paths = list(dict.fromkeys(found_paths))
-            found["notes"].append(f"not imported: {len(paths)} {what} ({paths[0]}{', ...' if paths[1:] else ''})")
+            found["notes"].append(unread_note(what, paths))
         found["default"] = str(self._stage.GetDefaultPrim().GetPath()) if self._stage.GetDefaultPrim() else ""
         return found
 

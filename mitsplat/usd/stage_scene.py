@@ -34,6 +34,7 @@ from mitsplat.storage.files import JsonObject, storage_errors, write_text
 from mitsplat.usd.stage_assets import body_frames, make_stage_asset, merge_fields, placed_mesh, rigid_frame
 from mitsplat.usd.stage_images import fit_aperture
 from mitsplat.usd.stage_physics import Record
+from mitsplat.usd.stage_reader import unread_note
 from mitsplat.usd.stage_records import read_records
 
 _WIDTH = 1280
@@ -100,7 +101,7 @@ def read_stage_scene(
         entries, poses = _write_objects(path, folder, records, groups, frames, notes)
         data: JsonObject = {"name": path.stem, "objects": entries, "shapes": _shapes(records, folder)}
         if hidden := [one["path"] for one in records["meshes"] if one["visible"] and one["body"] is not None]:
-            notes.append(f"not rendered: meshes of rigid bodies; only their splats are: {', '.join(hidden)}")
+            notes.append(unread_note("meshes of rigid bodies, of which only splats are rendered", hidden))
         if surroundings:
             _environment(path, records, surroundings, notes).save(folder / "assets" / "environment")
             data["environment"] = "assets/environment"
@@ -180,10 +181,14 @@ def _camera_tracks(
         frames = _motion(path, record, records["times"], notes)
         cameras.append(tuple(replace(camera, world_from_camera=frame @ OPENCV_FROM_OPENGL) for frame in frames))
     first = cameras[0][0]
-    same = [track for track in cameras if (track[0].width, track[0].height) == (first.width, first.height)]
-    if len(same) < len(cameras):
-        notes.append("not imported: cameras whose images have another size than those of the first one")
-    return same
+    others = [
+        record["path"]
+        for record, (camera, *_) in zip(records["cameras"], cameras, strict=True)
+        if camera.size != first.size
+    ]
+    if others:
+        notes.append(unread_note("cameras whose images have another size than those of the first one", others))
+    return [track for track in cameras if track[0].size == first.size]
 
 
 def _object(

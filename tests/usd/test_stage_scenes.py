@@ -95,7 +95,7 @@ def test_a_stage_of_usd_core_renders_with_labels_that_pass_the_audit(
     assert run("render", tmp_path / "balls.usda", "-o", tmp_path / "out", "--format", "yolo,bop") == 0
     printed = capsys.readouterr().out
     assert "not imported: the light /World/tube of type CylinderLight" in printed
-    assert "not rendered: meshes of rigid bodies; only their splats are: /World/body" in printed
+    assert "not imported: 1 meshes of rigid bodies, of which only splats are rendered (/World/body)" in printed
     assert printed.count("has no colliders; the convex hull of its splats casts its shadows") == 5
     assert run("audit", tmp_path / "out") == 0
     (line,) = (tmp_path / "out/manifest.jsonl").read_text().splitlines()
@@ -270,6 +270,21 @@ def test_a_render_product_states_size_and_fit_of_the_image_of_its_camera(
         f"fitted by the policy {policy or 'expandAperture'}",
     ):
         assert note in found.notes
+
+
+def test_cameras_with_images_of_another_size_are_named(tmp_path: Path) -> None:
+    write_balls(tmp_path / "balls.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "balls.usda"))
+    for name in ("camera_2", "camera_3"):
+        UsdGeom.Camera.Define(stage, f"/World/{name}")
+        product = UsdRender.Product.Define(stage, f"/Render/{name}")
+        product.CreateCameraRel().SetTargets([f"/World/{name}"])
+        product.CreateResolutionAttr(Gf.Vec2i(64, 64))
+    stage.Save()
+    found = read_stage_scene(tmp_path / "balls.usda", tmp_path / "scene")
+    assert len(found.cameras) == 1
+    note = "cameras whose images have another size than those of the first one (/World/camera_2, ...)"
+    assert f"not imported: 2 {note}" in found.notes
 
 
 def test_prototypes_of_a_point_instancer_are_not_drawn_by_themselves(tmp_path: Path) -> None:

@@ -61,6 +61,19 @@ def test_a_red_wall_reflects_half_of_its_colour(wall: Any) -> None:
     np.testing.assert_allclose(without, 0.5, atol=0.03)
 
 
+def test_surroundings_with_changed_colours_reflect_these() -> None:
+    """The wall of :func:`test_a_red_wall_reflects_half_of_its_colour` with permuted colours at half the brightness."""
+    make_integrator()
+    shapes = {
+        "wall": captured_wall(colours="0 0.5 0 0 0 0.5 0.5 0 0"),
+        "object": make_splats_shape(floor(0.02), proxy=slab(0.02), instance=1, capture_light="uniform"),
+        "sky": WHITE_SKY,
+    }
+    camera = down_camera(0.2, 32, 6.0)
+    with_bounce, without = (noise_free(shapes, camera, white=np.pi, bounce=b).light for b in (True, False))
+    np.testing.assert_allclose((with_bounce - without).mean(axis=(0, 1)) / (0.5 * RED[[1, 2, 0]]), 0.5, atol=0.03)
+
+
 @pytest.mark.parametrize("receiver", ["captured", "object"])
 def test_an_object_reflects_half_of_its_colour(receiver: str) -> None:
     """The red wall is an object. It hides half of a uniform sky, and reflects the other half.

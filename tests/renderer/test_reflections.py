@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from mitsplat.arrays import Float64Array
 from mitsplat.gaussians.spherical_harmonics import SH_C0, evaluate_sh
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
@@ -269,24 +270,29 @@ def test_variance_is_that_of_the_rays_that_start_at_a_surface(valid: int) -> Non
     assert np.array(shown.variance).mean() == pytest.approx(expected, rel=0.05)
 
 
-def test_mirror_shows_captured_colours_of_its_directions() -> None:
-    """A captured ceiling is brighter at grazing angles: a small mirror shows 0.5 + sum_k sh_k Y_k(d), decoded."""
+@pytest.mark.parametrize("matrix", [np.eye(3), 0.9 * np.eye(3)[[1, 2, 0]]], ids=["captured", "changed"])
+def test_mirror_shows_captured_colours_of_its_directions(matrix: Float64Array) -> None:
+    """A captured ceiling is brighter at grazing angles: a small mirror shows 0.5 + sum_k sh_k Y_k(d), decoded.
+
+    The matrix of an appearance applies to these linear colours.
+    """
     make_integrator()
     sh = np.zeros((1600, 4, 3))
     sh[:, 1:, 0], sh[:, 1:, 1], sh[:, 2, 2] = 0.1, (-0.1, 0.05, 0.1), -0.2
     small = replace(floor(0.05), materials=SplatMaterials.uniform(1600, metallic=1.0, roughness=0.02))
     turn = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))
     ceiling = replace(floor(4.0, z=1.0), sh=sh).transformed(turn.T)
+    colours = {} if np.array_equal(matrix, np.eye(3)) else {"colours": " ".join(map(str, matrix.ravel()))}
     scene = {
         "type": "scene",
         "mirror": make_splats_shape(small, proxy=slab(0.05), instance=1),
-        "ceiling": make_splats_shape(ceiling, turn, proxy=slab(4.0, top=1.0).apply_transform(turn.T)),
+        "ceiling": make_splats_shape(ceiling, turn, proxy=slab(4.0, top=1.0).apply_transform(turn.T), **colours),
         "sky": WHITE_SKY,
     }
     camera = Camera.look_at((0.3, -0.6, 0.5), (0, 0, 0), width=40, height=30, fov_x=5)
     layers = render_layers(make_integrator(white=np.pi, hide_emitters=True), mi.load_dict(scene), camera)
     along = camera.world_from_camera[:3, 2] * (1, 1, -1)
-    expected = decode_srgb(evaluate_sh(sh[0], along))
+    expected = matrix @ decode_srgb(evaluate_sh(sh[0], along))
     assert np.ptp(expected) > 0.1
     inside = binary_erosion(layers.instance == 1, iterations=2)
     seen = (layers.light + layers.highlight)[inside].mean(axis=0)

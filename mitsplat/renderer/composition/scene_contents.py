@@ -112,7 +112,8 @@ class ContentsReader:
             return None
         largest = max(static, key=lambda c: len(c.splats))
         if self._grid is None or not self._grid[0].holds_for([largest]):
-            self._grid = ShapeState.of([largest]), RadianceGrid.build(largest.splats, largest.world_from_splats)
+            grid = RadianceGrid.build(largest.splats, largest.world_from_splats, largest.appearance)
+            self._grid = ShapeState.of([largest]), grid
         return self._grid[1]
 
     def _upload(self, distinct: list[Splats]) -> CloudSet | None:

@@ -8,6 +8,7 @@ times as bright as the mat from above.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +21,7 @@ from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.rigid import transform_points
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.projection.gaussian import srgb_to_linear
+from mitsplat.renderer.projection.splat_appearance import SplatAppearance, changed_colours
 from mitsplat.renderer.rays.device_arrays import wrapped
 
 CELLS = 80
@@ -45,14 +47,28 @@ class RadianceGrid:
     cells: mi.Point3i
 
     @classmethod
-    def build(cls, splats: Splats, world_from_splats: Float64Array) -> RadianceGrid | None:
-        """Build the grid from the splats with opacity above 0.5; return None if there are none."""
+    def build(
+        cls, splats: Splats, world_from_splats: Float64Array, appearance: SplatAppearance | None = None
+    ) -> RadianceGrid | None:
+        """Build the grid from the splats with opacity above 0.5; return None if there are none.
+
+        Args:
+            splats: The surroundings in their own frame.
+            world_from_splats: Similarity transform, shape (4, 4).
+            appearance: Change of their colours, or None.
+        """
         opaque = splats.opacities > 0.5
         if not opaque.any():
             return None
         points = transform_points(world_from_splats, splats.means[opaque])
-        colours = decode_srgb(np.clip(0.5 + SH_C0 * splats.sh[opaque, 0], 0.0, None))
+        encoded = 0.5 + SH_C0 * splats.sh[opaque, 0]
         slopes = _slopes(splats.sh[opaque, :4], world_from_splats[:3, :3])
+        if appearance is not None:
+            change = partial(changed_colours, appearance=appearance, points=splats.means[opaque])
+            ends = [(change(encoded + slope), change(encoded - slope)) for slope in np.moveaxis(slopes, 2, 0)]
+            slopes = np.stack([(ahead - behind) / 2 for ahead, behind in ends], axis=2)
+            encoded = change(encoded)
+        colours = decode_srgb(np.clip(encoded, 0.0, None))
         area = np.prod(np.sort(splats.scales[opaque], axis=1)[:, 1:], axis=1)
         low, high = points.min(axis=0), points.max(axis=0)
         size = float((high - low).max()) / CELLS or 1.0

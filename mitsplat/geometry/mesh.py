@@ -70,7 +70,8 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     Args:
         mesh: Surface [m]; it may be inside out or have holes.
         name: Name of the mesh in messages.
-        solid: True if the mesh must enclose a volume, as objects must. A scan of the environment need not.
+        solid: True if the mesh must enclose a volume, as objects must. A scan of the environment need not. If it is
+            open, its faces and holes are kept.
 
     Raises:
         InputError: If the mesh is empty, is not finite, has no volume, or has a size that indicates wrong units.
@@ -80,10 +81,11 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     welded.merge_vertices(merge_tex=True, merge_norm=True)
     welded.update_faces(welded.nondegenerate_faces())
     welded.remove_unreferenced_vertices()
-    welded.fill_holes()  # of three or four edges, where slivers were removed
-    # Divergence theorem: sum of the tetrahedra from the origin to each triangle.
-    volume = float(np.linalg.det(welded.triangles).sum()) / 6
-    if volume < 0:
+    if solid:
+        welded.fill_holes()  # of three or four edges, where slivers were removed
+    # Divergence theorem: sum of the tetrahedra from the centre to each triangle. Holes matter least from there.
+    volume = float(np.linalg.det(welded.triangles - mesh.bounds.mean(axis=0)).sum()) / 6
+    if volume < 0 and (solid or welded.is_watertight):  # an open scan has no inside
         _logger.warning("%s: the mesh is inside out; physics flips its faces", name)
         welded.invert()
     if solid and abs(volume) < 1e-6 * size**3:

@@ -6,6 +6,7 @@ import trimesh
 
 from mitsplat.errors import InputError
 from mitsplat.geometry.mesh import contact_points, mass_properties, prepare_mesh
+from mitsplat.geometry.mesh_distance import DistanceSurface
 
 
 def test_mass_and_inertia_of_a_box_equal_their_closed_forms():
@@ -26,6 +27,8 @@ def test_a_given_mass_overrules_density():
     found = mass_properties(box, (), density=1.0, mass=3.0)
     assert found.mass == pytest.approx(3.0)
     np.testing.assert_allclose(np.diag(found.inertia), 3.0 * 0.02 / 12)
+    box.density = 7800.0  # a density that the mesh itself states is ignored
+    np.testing.assert_allclose(mass_properties(box, (), density=1.0, mass=3.0).inertia, found.inertia)
 
 
 def test_an_open_mesh_has_the_mass_of_its_pieces():
@@ -46,6 +49,35 @@ def test_a_missing_triangle_is_restored():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     box.update_faces(np.arange(len(box.faces)) != 3)
     assert prepare_mesh(box, "box").is_volume
+
+
+def test_an_open_mesh_far_from_its_origin_keeps_its_faces(caplog):
+    lidless = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide()  # a hole of eight edges is not filled
+    lidless.update_faces(lidless.face_normals[:, 2] < 0.5)
+    lidless.apply_translation((0.2, 0, 1))
+    np.testing.assert_allclose(prepare_mesh(lidless, "box").face_normals, lidless.face_normals, atol=1e-12)
+    assert "inside out" not in caplog.text
+
+
+def test_scanned_surroundings_keep_their_faces():
+    """A recess below z = 0 and a plane at z = 0, seen from above, are open; a closed slab has an outer side.
+
+    Both openings have four edges, as those of removed slivers, but are not filled.
+    """
+    table = trimesh.creation.box((1, 1, 0.1))
+    recess = trimesh.Trimesh(table.vertices - (0, 0, 0.05), table.faces[table.face_normals[:, 2] < 0.5][:, ::-1])
+    plane = trimesh.Trimesh(table.vertices - (0, 0, 0.05), table.faces[table.face_normals[:, 2] > 0.5])
+    for scan in (recess, plane):
+        found = prepare_mesh(scan, "scan", solid=False)
+        np.testing.assert_allclose(found.face_normals, scan.face_normals, atol=1e-12)
+    np.testing.assert_array_less(
+        0,
+        DistanceSurface(prepare_mesh(recess, "scan", solid=False)).signed_distances(
+            np.array([[0, 0, -0.09], [0.4, 0.4, -0.05]])
+        ),
+    )
+    table.invert()
+    assert prepare_mesh(table, "slab", solid=False).volume == pytest.approx(0.1)
 
 
 def test_each_repair_is_logged_in_one_sentence(caplog):

@@ -272,6 +272,9 @@ class TestYolo:
             if is_upright:
                 np.testing.assert_allclose([*corners.min(axis=0), *corners.max(axis=0)], label.box, atol=1e-6)
                 continue
+            one, other, *_ = sides = np.roll(corners, -1, axis=0) - corners
+            np.testing.assert_allclose(sides[2:], [-one, -other], atol=1e-6)  # a rectangle
+            assert one @ other == pytest.approx(0, abs=1e-3)
             middle, extents, _ = cv2.minAreaRect(corners.astype(np.float32))
             assert min(extents) == pytest.approx(thickness, abs=3)
             assert max(extents) > 150

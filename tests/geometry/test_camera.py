@@ -79,6 +79,22 @@ def test_intrinsics_that_are_no_numbers_are_refused(changes: dict[str, object]) 
         replace(PINHOLE, **changes)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("fov_x", [-10.0, 0.0, 180.0, 400.0])
+def test_a_field_of_view_of_no_pinhole_camera_is_refused(fov_x: float) -> None:
+    with pytest.raises(ValueError, match="fov_x must be between 0 and 180 degrees"):
+        Camera.look_at((0, 0, 1), (0, 0, 0), width=8, height=6, fov_x=fov_x)
+
+
+@pytest.mark.parametrize(
+    ("forward", "up", "upwards"),
+    [((0, 0, -1), (0, 0, 1), (0, 1, 0)), ((0, 2, 0), (0, 1, 0), (0, 0, 1)), ((0, -3, 0), (0, 1, 0), (0, 0, 1))],
+)
+def test_the_upper_edge_of_a_view_along_the_upper_direction(
+    forward: tuple[float, ...], up: tuple[float, ...], upwards: tuple[float, ...]
+) -> None:
+    np.testing.assert_allclose(look_at_pose((0, 0, 0), forward, up)[:3, 1], -np.array(upwards))
+
+
 def test_a_field_of_view_in_radians_is_reported() -> None:
     with pytest.warns(UserWarning, match=r"fov_x is 0\.86 degrees: is it in radians\? Then it is 49\.3 degrees"):
         Camera.look_at((0, 0, 1), (0, 0, 0), width=64, height=48, fov_x=0.86)

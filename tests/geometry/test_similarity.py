@@ -56,6 +56,7 @@ WRONG = {
     "slightly uneven": (np.diag([1.0, 1.0, 1.001, 1.0]), "must scale uniformly and not shear"),
     "sheared": (SHEARED, "must scale uniformly and not shear"),
     "projective": (np.diag([1.0, 1.0, 1.0, 2.0]), "must have the last row 0 0 0 1 (got [0.0, 0.0, 0.0, 2.0])"),
+    "mirrored weight": (np.diag([1.0, 1.0, 1.0, -1.0]), "must have the last row 0 0 0 1 (got [0.0, 0.0, 0.0, -1.0])"),
     "transposed": (TRANSPOSED, "is it transposed, with the translation there?"),
     "not finite": (np.full((4, 4), np.nan), "a transform must be a finite 4x4 matrix"),
 }

@@ -160,6 +160,27 @@ class TestRules:
         assert entry.truncation == pytest.approx(0.4)
         assert (entry.amodal.box, entry.silhouette_box, entry.silhouette_area) == ((0, 5, 6, 15), (-4, 5, 6, 15), 100)
 
+    @pytest.mark.parametrize(
+        ("x", "y", "inside"),
+        [(-4, 5, (0, 5, 6, 15)), (24, 5, (24, 5, 30, 15)), (5, -4, (5, 0, 15, 6)), (5, 14, (5, 14, 15, 20))],
+    )
+    def test_a_silhouette_is_cut_at_every_border(self, x, y, inside):
+        """Each 10 x 10 square reaches 4 px over one border; the rest of it is visible."""
+        ids = np.zeros((20, 30), dtype=np.uint16)
+        ids[inside[1] : inside[3], inside[0] : inside[2]] = 1
+        (entry,) = label(ids, alone={1: (np.ones((10, 10), dtype=bool), x, y)}).instances
+        assert (entry.amodal.box, entry.silhouette_box) == (inside, (x, y, x + 10, y + 10))
+        assert entry.truncation == pytest.approx(0.4)
+
+    def test_pixels_of_a_silhouette_without_a_depth_are_not_counted(self):
+        """A 10 x 10 square is hidden in half of its columns; a 3 x 3 corner of it has no depth."""
+        ids = np.zeros((20, 30), dtype=np.uint16)
+        ids[5:15, 5:10] = 1
+        truth = truth_of(ids, alone={1: (np.ones((10, 10), dtype=bool), 5, 5)})
+        truth.depth[5:8, 5:8] = 0
+        (entry,) = label_instances(truth, [Seen(1, 0, np.eye(4))], CLASSES, LabelRules()).instances
+        assert entry.depth_area == 100 - 9
+
     def test_a_mask_that_only_touches_the_border_is_not_truncated(self):
         ids = np.zeros((20, 30), dtype=np.uint16)
         ids[0:6, 10:16] = 1

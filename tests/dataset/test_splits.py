@@ -142,3 +142,16 @@ def test_folds_distribute_classes_and_keep_layouts_together(folds: int) -> None:
     for name in ("nut", "bolt"):
         assert max(counts[name]) - min(counts[name]) <= 6
     assert assign_folds(dict(reversed(layouts.items())), folds) == fold_of
+
+
+@pytest.mark.parametrize("folds", [2, 3])
+def test_folds_of_unequal_layouts_have_equal_sizes(folds: int) -> None:
+    """Some layouts are empty, and others have 50 instances of a class that is in few layouts."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        counts = rng.integers(0, 2, (6, 3)) * rng.integers(1, 50, (6, 3))
+        layouts = {
+            i: Counter({name: int(n) for name, n in zip("abc", row, strict=True) if n}) for i, row in enumerate(counts)
+        }
+        sizes = Counter(assign_folds(layouts, folds).values())
+        assert [sizes[fold] for fold in range(folds)] == [6 // folds] * folds

@@ -14,7 +14,7 @@ from mitsplat.errors import InputError
 from mitsplat.formats.colmap import camera_model
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.camera_poses import look_at_pose
-from mitsplat.geometry.lens import turning_slope
+from mitsplat.geometry.lens import Lens, turning_slope
 from mitsplat.renderer.layers import describe_sensor
 from mitsplat.runtime.variant import ensure_variant
 
@@ -135,10 +135,27 @@ def test_the_sensor_plugin_refuses_invalid_lenses(wrong: dict[str, str]) -> None
         mi.load_dict({**describe_sensor(PINHOLE), **wrong})
 
 
-def test_the_colmap_model_of_a_fisheye_is_opencv_fisheye() -> None:
-    assert camera_model(FISHEYE).split() == (
-        ["OPENCV_FISHEYE", "640", "480", "300.0", "290.0", "330.0", "235.0", "0.02", "-0.01", "0.004", "-0.001"]
-    )
+@pytest.mark.parametrize(
+    ("distortion", "lens", "model", "parameters"),
+    [
+        ((), "opencv", "PINHOLE", ()),
+        (BENT, "opencv", "OPENCV", BENT),
+        ((*BENT, 0.003), "opencv", "FULL_OPENCV", (*BENT, 0.003, 0, 0, 0)),
+        ((*BENT, 0.003, 0.02, 0.01, 0.002), "opencv", "FULL_OPENCV", (*BENT, 0.003, 0.02, 0.01, 0.002)),
+        (BENT, "fisheye", "OPENCV_FISHEYE", BENT),
+    ],
+)
+def test_the_colmap_model_has_the_coefficients_of_the_lens(
+    distortion: tuple[float, ...], lens: Lens, model: str, parameters: tuple[float, ...]
+) -> None:
+    name, *numbers = camera_model(replace(FISHEYE, distortion=distortion, lens=lens)).split()
+    assert name == model
+    assert [*map(float, numbers)] == [640, 480, 300, 290, 330, 235, *parameters]
+
+
+def test_colmap_has_no_thin_prism_distortion() -> None:
+    with pytest.raises(InputError, match="a lens without thin-prism distortion"):
+        camera_model(replace(PINHOLE, distortion=(*BENT, 0.0, 0.0, 0.0, 0.0, 0.001, 0.0, 0.0, 0.0)))
 
 
 THIN = replace(PINHOLE, aperture_radius=0.002, focus_distance=0.008, near=0.004)

@@ -2,6 +2,7 @@
 
 import io
 import json
+import zlib
 from dataclasses import dataclass
 
 import cv2
@@ -408,6 +409,9 @@ def test_masks_written_as_png_are_read_by_opencv_and_pillow(size, share):
             assert picture.mode == "L"
             np.testing.assert_array_equal(np.asarray(picture), canvas)
         Image.open(io.BytesIO(data)).verify()
+        # Both ignore rows beyond the last one. Between the header (33 bytes) and IEND (12) is one chunk IDAT.
+        rows = zlib.decompress(data[33 + 8 : -12 - 4])
+        assert rows == np.pad(canvas, ((0, 0), (1, 0))).tobytes()
 
 
 def test_json_keeps_the_labels():

@@ -148,9 +148,10 @@ class TestRules:
         ids = np.zeros((12, 12), dtype=np.uint16)
         ids[2:8, 2:8] = 3
         block = np.ones((3, 3), dtype=bool)
-        labels = label(ids, alone={1: (block, 4, 4), 2: (block, 12, 4)})
+        outside = [(12, 4), (14, 4), (-5, 4), (4, 14), (4, -5)]
+        labels = label(ids, alone={1: (block, 4, 4)} | {i: (block, *corner) for i, corner in enumerate(outside, 4)})
         assert [entry.id for entry in labels.instances] == [3]
-        assert (labels.dropped["hidden"], labels.dropped["outside"]) == (1, 1)
+        assert (labels.dropped["hidden"], labels.dropped["outside"]) == (1, len(outside) + 1)  # 2 is nowhere
 
     def test_visible_fraction_and_truncation_are_shares_of_the_silhouette(self):
         """A 10 x 10 square reaches 4 px over the left border; 2 of its 6 columns in the image are hidden."""

@@ -47,6 +47,9 @@ def scene_of(data: SceneData, write_scene: WriteScene) -> Scene:
 
 
 def test_objects_above_the_belt_move_along_it(belt_data: SceneData, write_scene: WriteScene) -> None:
+    """Another box, which is the first shape, is beside the belt."""
+    post = {"size": [0.1, 0.1, 1], "position": [0, 0.9, 0]}
+    belt_data["shapes"].insert(0, {"name": "post", "box": post, "visible": True})
     spec = scene_of(belt_data, write_scene).spec
     beside, below = (0.0, 0.45, 0.01), (0.0, 0.0, -0.2)
     layout = lying((0.1, 0.0, 0.01), beside, below, (-0.1, 0.05, 0.3))
@@ -82,6 +85,7 @@ def test_a_scene_without_a_belt_keeps_its_layout(scene_data: SceneData, write_sc
         ({"belt": "table"}, "conveyor.belt: must be the name of a box among the shapes, belt (got table)"),
         ({"speed": 0.0}, "conveyor.speed: must not be 0"),
         ({"interval": 0.0}, "conveyor.interval: must be > 0"),
+        ({"speed": 3.0}, "conveyor.belt: its box must be 1.45 m long, so that the objects of its region stay on it"),
         ({"speed": -3.0}, "conveyor.belt: its box must be 1.45 m long, so that the objects of its region stay on it"),
     ],
 )
@@ -94,8 +98,11 @@ def test_invalid_belts_are_refused(
     assert sentence in str(caught.value)
 
 
-def test_a_belt_below_no_region_is_refused(belt_data: SceneData, write_scene: WriteScene) -> None:
-    belt_data["shapes"][0]["box"]["position"] = [3, 0, 0]
+@pytest.mark.parametrize("position", [(3, 0, 0), (-3, 0, 0), (-0.75, 1.3, 0), (0.75, -1.3, 0), (0, 0, 3)])
+def test_a_belt_below_no_region_is_refused(
+    belt_data: SceneData, write_scene: WriteScene, position: tuple[float, ...]
+) -> None:
+    belt_data["shapes"][0]["box"]["position"] = list(position)
     with pytest.raises(InputError, match=r"conveyor\.belt: must be below a region, so that it carries objects"):
         scene_of(belt_data, write_scene)
 

@@ -172,6 +172,11 @@ class SplatsShape(mi.Mesh):
         self.world_from_splats = self._placed(pose)
         self.appearance = self._read_appearance(given)
 
+    @property
+    def relit(self) -> bool:
+        """True if the colours are base colours or were captured under uniform light."""
+        return self.splats.materials is not None or self.capture_light == "uniform"
+
     def _placed(self, pose: np.ndarray) -> np.ndarray:
         """Return the transform of the splats for a value of ``to_world``."""
         try:

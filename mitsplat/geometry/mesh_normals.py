@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import trimesh
 
@@ -11,6 +13,14 @@ CREASE_ANGLE = np.radians(28.0)
 """Dihedral angle above which an edge is a crease [rad]. Gaussians must not cross creases; normals are not smoothed
 there.
 """
+
+NOISE_CREASE = 10.0
+"""Dihedral angle of a crease over the lower quartile of a mesh's dihedral angles. The quartile is zero for CAD meshes,
+whose flat faces have interior edges, and 2 to 8 degrees for reconstructed smooth surfaces.
+"""
+
+SHARPEST = np.radians(80.0)
+"""Dihedral angle that is a crease in every mesh [rad]."""
 
 
 def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE) -> Float64Array:
@@ -33,6 +43,20 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
     flat = _flat_normals(mesh)[corner].reshape(-1, 3, 3)
     return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-30), flat))
+
+
+@lru_cache(maxsize=64)
+def smooth_normals(mesh: trimesh.Trimesh) -> Float64Array:
+    """Return unit normals (F, 3, 3) at the corners of faces, smooth except across creases of this mesh; cached.
+
+    Reconstructed surfaces are rough everywhere, so that an angle that is a crease in a CAD mesh is noise in them. An
+    edge is therefore a crease only if it is much sharper than the flattest quarter of all edges, by length.
+    """
+    angles, ends = mesh.face_adjacency_angles, mesh.vertices[mesh.face_adjacency_edges]
+    order = np.argsort(angles)
+    lengths = np.cumsum(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)[order])
+    usual = angles[order[np.searchsorted(lengths, 0.25 * lengths[-1])]] if len(order) else 0.0
+    return corner_normals(mesh, crease_angle=float(np.clip(NOISE_CREASE * usual, CREASE_ANGLE, SHARPEST)))
 
 
 def _flat_normals(mesh: trimesh.Trimesh) -> Float64Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
@@ -21,7 +23,7 @@ from tests.renderer.test_light import WHITE_SKY, area_light, down_camera, floor,
 RED = np.array([0.8, 0.2, 0.1])
 
 
-def captured_wall(**options: Any) -> Any:
+def captured_wall(materials: SplatMaterials | None = None, **options: Any) -> Any:
     wall = trimesh.creation.box(bounds=[[0.3, -500, -500], [0.4, 500, 500]])
     encoded = 1.055 * RED ** (1 / 2.4) - 0.055
     sheet = floor(2.0)
@@ -31,7 +33,15 @@ def captured_wall(**options: Any) -> Any:
     painted = Splats(
         sheet.means, sheet.quats, sheet.scales, sheet.opacities, np.tile((encoded - 0.5) / SH_C0, (1600, 1, 1))
     ).transformed(turn)
-    return make_splats_shape(painted, proxy=wall, **options)
+    return make_splats_shape(replace(painted, materials=materials), proxy=wall, **options)
+
+
+def relit_wall() -> Any:
+    return captured_wall(capture_light="uniform")
+
+
+def wall_of_materials() -> Any:
+    return captured_wall(SplatMaterials.uniform(1600, roughness=1.0, specular=0.0))
 
 
 def visible_wall() -> Any:
@@ -42,11 +52,11 @@ def visible_wall() -> Any:
     }
 
 
-@pytest.mark.parametrize("wall", [captured_wall, visible_wall])
+@pytest.mark.parametrize("wall", [captured_wall, relit_wall, wall_of_materials, visible_wall])
 def test_a_red_wall_reflects_half_of_its_colour(wall: Any) -> None:
     """A red wall hides half of a uniform sky: E_bounce over the white irradiance is half the wall's colour.
 
-    A captured wall emits its captured colour; a mesh reflects the other half of the sky.
+    A wall captured under the light of the scene emits its captured colour; others reflect the other half of the sky.
     """
     make_integrator()
     shapes = {
@@ -72,6 +82,22 @@ def test_surroundings_with_changed_colours_reflect_these() -> None:
     camera = down_camera(0.2, 32, 6.0)
     with_bounce, without = (noise_free(shapes, camera, white=np.pi, bounce=b).light for b in (True, False))
     np.testing.assert_allclose((with_bounce - without).mean(axis=(0, 1)) / (0.5 * RED[[1, 2, 0]]), 0.5, atol=0.03)
+
+
+@pytest.mark.parametrize("wall", [relit_wall, wall_of_materials])
+def test_a_metal_plate_mirrors_relit_surroundings(wall: Any) -> None:
+    """Relit walls are as bright as half of the sky in front of them, whatever their light was when captured."""
+    make_integrator()
+    metal = replace(floor(0.02), materials=SplatMaterials.uniform(1600, metallic=1.0, roughness=0.1))
+    shapes = {
+        "wall": wall(),
+        "plate": make_splats_shape(metal, proxy=slab(0.02), instance=1),
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 3.0}},
+    }
+    camera = Camera.look_at((-0.2, 0, 0.2), (0, 0, 0), width=32, height=32, fov_x=6)
+    layers = noise_free(shapes, camera, white=np.pi, bounce=True)
+    shown = layers.instance == 1
+    np.testing.assert_allclose((layers.light + layers.highlight)[shown].mean(axis=0), 3 * RED, rtol=0.03)
 
 
 @pytest.mark.parametrize("receiver", ["captured", "object"])

@@ -15,12 +15,12 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.mesh_normals import CREASE_ANGLE
+from mitsplat.geometry.mesh_normals import CREASE_ANGLE, smooth_normals
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
 from mitsplat.renderer.light.light_points import POINT_STEP
 from mitsplat.renderer.light.light_tiles import BLOCK
 from mitsplat.renderer.light.shadow_rays import RECURRENCE, SURROUNDINGS_RECURRENCE, _bayer
-from mitsplat.renderer.occluders.proxies import Proxies, smooth_normals
+from mitsplat.renderer.occluders.proxies import Proxies
 
 WHITE_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}
 

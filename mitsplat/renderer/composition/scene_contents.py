@@ -90,7 +90,7 @@ class ContentsReader:
         clouds, meshes = self._upload(distinct), VisibleMeshes.build(visible)
         mirror = None
         if meshes is not None and meshes.diffuse is not None:
-            mirror = SplatMirror.build(clouds, placements, distinct, [c.capture_light == "uniform" for c in carriers])
+            mirror = SplatMirror.build(clouds, placements, distinct, [c.relit for c in carriers])
         self._contents = SceneContents(
             ShapeState.of(shapes),
             clouds,
@@ -107,7 +107,7 @@ class ContentsReader:
 
     def _surroundings(self, carriers: list[mi.Shape]) -> RadianceGrid | None:
         """Return the radiance grid of the largest splats that were captured under the scene's light."""
-        static = [c for c in carriers if not c.dynamic and c.capture_light == "scene" and len(c.splats)]
+        static = [c for c in carriers if not (c.dynamic or c.relit) and len(c.splats)]
         if not static:
             return None
         largest = max(static, key=lambda c: len(c.splats))
@@ -144,7 +144,7 @@ def _refuse_unsupported(shape: mi.Shape) -> None:
 
 def _occluder(shape: mi.Shape) -> Occluder:
     """Return the proxy of a ``splats`` shape; captured surroundings take no material, see :class:`RadianceGrid`."""
-    splats = shape.splats if shape.dynamic or shape.splats.materials is not None else None
+    splats = shape.splats if shape.dynamic or shape.relit else None
     return Occluder(
         shape.proxy, shape.instance, shape.dynamic, shape.world_from_splats, splats, shape.appearance, shape.gloss
     )

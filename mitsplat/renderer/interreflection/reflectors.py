@@ -1,8 +1,8 @@
 """Light that surfaces reflect along rays: captured surroundings, objects and visible meshes.
 
 Captured surroundings keep their captured colour, which contains all earlier bounces. Dynamic objects cast shadows on
-them and reflect light onto them. Objects and visible meshes reflect the emitters' light according to their material,
-and the light of one further ray, which ends at the next surface.
+them and reflect light onto them. Objects, relit surroundings and visible meshes reflect the emitters' light according
+to their material, and the light of one further ray, which ends at the next surface.
 """
 
 from __future__ import annotations
@@ -92,9 +92,9 @@ class Reflectors:
     @property
     def any(self) -> bool:
         """True if any surface reflects light."""
-        dynamic = self.proxies.dynamic
-        objects = dynamic is not None and (self.proxies.shows_meshes or dynamic.materials is not None)
-        return objects or (self.grid is not None and self.proxies.static is not None)
+        reflecting = self.proxies.reflecting
+        lit = reflecting is not None and (self.proxies.shows_meshes or reflecting.materials is not None)
+        return lit or (self.grid is not None and self.proxies.captured is not None)
 
     def irradiance(
         self,
@@ -162,7 +162,7 @@ class Reflectors:
         self, ray: mi.Ray3f, key: mi.UInt32, emitter_sample: mi.Point2f, spread: mi.Float, bounces: int
     ) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
         """Return the colours (Color3f) at the hits of rays, the colours without dynamic objects, and the distances."""
-        static, dynamic = self.proxies.static, self.proxies.dynamic
+        static, reflecting = self.proxies.captured, self.proxies.reflecting
         captured, distance = mi.Color3f(dr.zeros(mi.Float, dr.width(key))), mi.Float(dr.inf)
         ray.maxt = dr.inf
         if static is not None:
@@ -173,16 +173,16 @@ class Reflectors:
             ray.maxt = distance = ground.t
             triangle = ground.prim_index
             dr.eval(triangle, ray, captured)
-        if dynamic is None:
+        if reflecting is None:
             return captured, captured, distance
-        near = dynamic.intersect(ray)
+        near = reflecting.intersect(ray)
         colour = dr.select(near.is_valid(), 0, captured)
         hits_object = near.is_valid()
         if self.emitters.sky is not None:  # indoors, the sky represents the light that walls reflect
             hits_object &= near.t < self.emitters.sky_reach
         distance = dr.select(near.is_valid(), dr.select(hits_object, near.t, dr.inf), distance)
         has_colour = dr.max(colour) > 0
-        boxes = self.proxies.boxes if bounces > 1 and dynamic.materials is not None else None
+        boxes = self.proxies.boxes if bounces > 1 and reflecting.materials is not None else None
         weight = mi.Color3f(1) if boxes is None else dr.full(mi.Color3f, 1, dr.width(key))
         dr.eval(near, colour, captured, hits_object, distance, has_colour, weight, key, emitter_sample)
         paths = Paths(ray, near, key, emitter_sample, spread, weight)
@@ -193,7 +193,7 @@ class Reflectors:
             hits = CapturedHits(static, self.grid, self.proxies, self.emitters, self.white)
             share = hits.arriving_share(place, number, light_sample)
             dr.scatter(colour, seen * share, lane)
-            onward = None if boxes is None else hits.paths_to_objects(dynamic, boxes, place, seen, number)
+            onward = None if boxes is None else hits.paths_to_objects(reflecting, boxes, place, seen, number)
             if onward is not None:
                 lane = dr.gather(mi.UInt32, lane, onward[0])
                 paths.set(lane, onward[1])
@@ -208,25 +208,25 @@ class Reflectors:
 
     def _reflected(self, bounces: int, paths: Paths) -> mi.Color3f:
         """Return the colour (Color3f) of objects and visible meshes: reflected light of one emitter and one ray."""
-        dynamic = self.proxies.dynamic
-        if dynamic is None:
+        reflecting = self.proxies.reflecting
+        if reflecting is None:
             return mi.Color3f(0)
-        materials, last = dynamic.materials, bounces == 1
+        materials, last = reflecting.materials, bounces == 1
         glossy = materials is not None and materials.glossy and not last
-        point = self._point_at(dynamic, paths.ray, paths.hit, paths.spread if glossy else None)
+        point = self._point_at(reflecting, paths.ray, paths.hit, paths.spread if glossy else None)
         lit = self._direct_light(point, paths.key, paths.emitter_sample)
         if not last and materials is not None:
             lit = self._with_onward_light(lit, point, paths.key, bounces - 1)
         return lit * paths.weight
 
     def _point_at(
-        self, dynamic: TraceScene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, spread: mi.Float | None
+        self, reflecting: TraceScene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, spread: mi.Float | None
     ) -> _Point:
         """Return the surface points at hits; with a ``spread``, with the specular lobes that reflect along the rays."""
-        visible = dynamic.is_visible(hit)
-        normal = dynamic.normal_at(hit.prim_index, ~visible)
-        surface = dynamic.surface_at(hit.prim_index, hit.prim_uv, ~visible)
-        colour, instance = surface.colour, dr.gather(mi.UInt32, dynamic.instances, hit.prim_index, ~visible)
+        visible = reflecting.is_visible(hit)
+        normal = reflecting.normal_at(hit.prim_index, ~visible)
+        surface = reflecting.surface_at(hit.prim_index, hit.prim_uv, ~visible)
+        colour, instance = surface.colour, dr.gather(mi.UInt32, reflecting.instances, hit.prim_index, ~visible)
         if self.proxies.shows_meshes:
             si = hit.compute_surface_interaction(ray)
             normal = dr.select(visible, si.n, normal)

@@ -29,9 +29,9 @@ class _Row(NamedTuple):
         """Return the parameters of a ``splats`` shape; means over its materials if it has any."""
         materials, gloss = shape.splats.materials, shape.gloss
         if materials is None:
-            return cls(shape.capture_light == "uniform", shape.roughness, 0.0, specular_of(shape.specular), True)
+            return cls(shape.relit, shape.roughness, 0.0, specular_of(shape.specular), True)
         return cls(
-            relit=True,
+            relit=shape.relit,
             roughness=float(materials.roughness.mean()) if gloss.roughness is None else gloss.roughness,
             metallic=float(materials.metallic.mean()),
             specular=float(materials.specular.mean()) if gloss.specular is None else gloss.specular,

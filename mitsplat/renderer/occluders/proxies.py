@@ -14,7 +14,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.mesh_normals import CREASE_ANGLE, corner_normals
+from mitsplat.geometry.mesh_normals import smooth_normals
 from mitsplat.renderer.materials.proxy_materials import (
     UNCHANGED_GLOSS,
     CornerMaterials,
@@ -27,20 +27,12 @@ from mitsplat.renderer.occluders.splat_occlusion import Caster, SplatOccluders
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
 
-NOISE_CREASE = 10.0
-"""Dihedral angle of a crease over the lower quartile of a mesh's dihedral angles. The quartile is zero for CAD meshes,
-whose flat faces have interior edges, and 2 to 8 degrees for reconstructed smooth surfaces.
-"""
-
 OPEN_EDGED_RAYS = 0.5
 """Rays per triangle in one call above which light is traced in a second scene without watertight edges.
 
 Embree prepares this scene in the time that about 40 rays per triangle save. All light of a frame takes 50 rays per
 triangle at 1280 x 720 pixels, with 70,000 triangles, and the scene serves all frames of a layout.
 """
-
-SHARPEST = np.radians(80.0)
-"""Dihedral angle that is a crease in every mesh [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +44,7 @@ class Occluder:
         instance: Instance id, 0 for the environment.
         dynamic: True if the captured colours do not contain its shadow.
         world_from_mesh: Pose, a similarity transform, shape (4, 4).
-        splats: Gaussians in the frame of the mesh that give it its material; None for a black surface.
+        splats: Gaussians in the frame of the mesh that give it its material; None for a black or captured surface.
         appearance: Change of the colours of the splats.
         gloss: Change of their roughness and specular.
     """
@@ -64,6 +56,11 @@ class Occluder:
     splats: Splats | None = None
     appearance: SplatAppearance | None = None
     gloss: GlossChange = UNCHANGED_GLOSS
+
+    @property
+    def is_captured(self) -> bool:
+        """True if its colours contain the light of the scene."""
+        return not self.dynamic and self.splats is None
 
     @property
     def part(self) -> ProxyPart:
@@ -169,6 +166,8 @@ class Proxies:
 
     Attributes:
         static, dynamic: These scenes, for hits.
+        captured: Static proxies that show captured light, which reflected rays meet.
+        reflecting: Other proxies and the visible shapes, which reflect the light of the emitters.
         shadow_casters: Scenes that cast the shadows of dynamic objects: none, one or two.
         boxes: Boxes around the dynamic proxies, see :class:`Boxes`; None if there are none.
         shows_meshes: True if the dynamic proxies include visible meshes.
@@ -185,6 +184,10 @@ class Proxies:
         """
         self.static = TraceScene.build([o for o in occluders if not o.dynamic])
         self.dynamic = TraceScene.build([o for o in occluders if o.dynamic], visible)
+        self.captured, self.reflecting = self.static, self.dynamic
+        if any(not o.dynamic and o.splats is not None for o in occluders):
+            self.captured = TraceScene.build([o for o in occluders if o.is_captured])
+            self.reflecting = TraceScene.build([o for o in occluders if not o.is_captured], visible)
         shadow_casters = (
             [self.dynamic] if casters is None else [TraceScene.build([], visible), SplatOccluders.build(casters)]
         )
@@ -336,9 +339,9 @@ class TraceScene:
         return _merged_scene(parts, others) if others else _cached_scene(parts, str(mi.variant()))
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=3)
 def _cached_scene(parts: tuple[ProxyPart, ...], _variant: str) -> TraceScene:
-    """Return the merged meshes, cached for the static meshes of all layouts and the last dynamic ones."""
+    """Return the merged meshes, cached for the static ones of all layouts and the last dynamic and reflecting ones."""
     return _merged_scene(parts, {})
 
 
@@ -383,17 +386,3 @@ def _own_corners(mesh: trimesh.Trimesh, splats: Splats | None) -> tuple[Float64A
         own = [divided.interpolate(values) for values in own]
         own[1] /= np.linalg.norm(own[1], axis=2, keepdims=True)
     return own[0].reshape(-1, 3), own[1].reshape(-1, 3)
-
-
-@lru_cache(maxsize=64)
-def smooth_normals(mesh: trimesh.Trimesh) -> Float64Array:
-    """Return corner normals (3 T, 3), cached across layouts.
-
-    Reconstructed surfaces are rough everywhere, so that an angle that is a crease in a CAD mesh is noise in them. An
-    edge is therefore a crease only if it is much sharper than the flattest quarter of all edges, by length.
-    """
-    angles, ends = mesh.face_adjacency_angles, mesh.vertices[mesh.face_adjacency_edges]
-    order = np.argsort(angles)
-    lengths = np.cumsum(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)[order])
-    usual = angles[order[np.searchsorted(lengths, 0.25 * lengths[-1])]] if len(order) else 0.0
-    return corner_normals(mesh, crease_angle=float(np.clip(NOISE_CREASE * usual, CREASE_ANGLE, SHARPEST)))

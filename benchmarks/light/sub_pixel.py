@@ -33,18 +33,18 @@ def main() -> None:
     options = parser.parse_args()
     width, height = map(int, options.size.split("x"))
     errors = []
-    with (
-        recording("light.sub_pixel", parser, options),
-        renderer(options.scene, width, height, "edges") as usual,
-        renderer(options.scene, TRUTH * width, TRUTH * height, 1) as large,
-    ):
-        for index in range(options.frames):
-            layout = ms.settle_layout(usual.scene, layout_index_of(usual.scene, index))
-            frame = usual.render(index, layout=layout)
-            truth = shown(large.render(index, layout=layout), TRUTH)
-            error = np.abs(shown(frame) - truth)[frame.instance > 0].max(axis=-1)
-            print(f"image {index}: {len(error)} pixels of objects, {np.count_nonzero(error > LARGE)} wrong")
-            errors.append(error)
+    with recording("light.sub_pixel", parser, options):
+        with (
+            renderer(options.scene, width, height, "edges") as usual,
+            renderer(options.scene, TRUTH * width, TRUTH * height, 1) as large,
+        ):
+            for index in range(options.frames):
+                layout = ms.settle_layout(usual.scene, layout_index_of(usual.scene, index))
+                frame = usual.render(index, layout=layout)
+                truth = shown(large.render(index, layout=layout), TRUTH)
+                error = np.abs(shown(frame) - truth)[frame.instance > 0].max(axis=-1)
+                print(f"image {index}: {len(error)} pixels of objects, {np.count_nonzero(error > LARGE)} wrong")
+                errors.append(error)
         error = np.concatenate(errors)
         wrong, rms = np.count_nonzero(error > LARGE), float(np.sqrt(np.mean(error**2)))
         figure(len(error), "", "pixels")

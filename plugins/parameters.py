@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NoReturn
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -60,6 +61,13 @@ class Parameters:
         if not (min(red, green, blue) > 0 and max(red, green, blue) < np.inf):
             self.refuse(name, "be > 0", value)
         return red, green, blue
+
+    def point(self, name: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Return three finite numbers."""
+        x, y, z = (float(v) for v in self._typed(name, default, (dr.scalar.Array3f64,), "a point"))
+        if not np.isfinite([x, y, z]).all():
+            self.refuse(name, "be finite", [x, y, z])
+        return x, y, z
 
     def integer(self, name: str, default: int, least: int, most: int) -> int:
         """Return an integer from ``least`` to ``most``."""

@@ -177,7 +177,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             max_depth=given.integer("max_depth", 8, 2, 64),
             white=given.colour("white", np.pi),
             sky_reach=sky_reach,
-            reference=tuple(float(v) for v in np.array(props.get("reference", mi.ScalarPoint3f(0))).ravel()),
+            reference=given.point("reference", (0.0, 0.0, 0.0)),
         )
 
     def aov_names(self) -> list[str]:

@@ -29,13 +29,15 @@ def test_missing_parameters_have_their_defaults() -> None:
         3,
     )
     assert none.choice("a", "one", "two") == "one"
+    assert none.point("a", (1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
     with pytest.raises(InputError, match=r"^shape 'splats': 'a' is missing$"):
         none.positive("a", None)
 
 
 def test_given_parameters_are_read() -> None:
-    some = given(text="b", truth=False, whole=3, number=0.5)
+    some = given(text="b", truth=False, whole=3, number=0.5, point=[1, 2.5, 3])
     assert (some.string("text", ""), some.boolean("truth", True), some.integer("whole", 0, 0, 3)) == ("b", False, 3)
+    assert some.point("point", (0.0, 0.0, 0.0)) == (1.0, 2.5, 3.0)
     assert (some.number("number", 1), some.number("whole", 1), some.choice("text", "a", "b")) == (0.5, 3.0, "b")
 
 
@@ -51,6 +53,9 @@ def test_given_parameters_are_read() -> None:
         (1, "boolean", (True,), "'x' must be true or false (got 1)"),
         (1, "string", ("",), "'x' must be text (got 1)"),
         ("c", "choice", ("a", "b"), "'x' must be 'a' or 'b' (got 'c')"),
+        (1.0, "point", ((0, 0, 0),), "'x' must be a point (got 1.0)"),
+        ("1 2 3", "point", ((0, 0, 0),), "'x' must be a point (got '1 2 3')"),
+        ([0.0, float("nan"), 1.0], "point", ((0, 0, 0),), "'x' must be finite (got [0.0, nan, 1.0])"),
     ],
 )
 def test_parameters_of_another_type_or_range_are_refused(

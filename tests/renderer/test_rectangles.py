@@ -12,7 +12,7 @@ import pytest
 from mitsplat.runtime.variant import ensure_variant
 
 ensure_variant()
-from mitsplat.renderer.emitters.emitter_sampling import receiver  # noqa: E402
+from mitsplat.renderer.emitters.emitter_sampling import Emitters, receiver  # noqa: E402
 from mitsplat.renderer.emitters.rectangle_lights import Rectangles  # noqa: E402
 
 
@@ -114,3 +114,23 @@ def test_rays_towards_sample_points_hit_the_rectangle_with_the_same_radiance_and
     np.testing.assert_allclose(radiance[:, front] / same[front], np.array(light)[:, front], rtol=1e-3)
     backwards = table.along(mi.Ray3f(place, -direction))[1]
     assert np.isinf(np.array(backwards)).mean() > 0.9
+
+
+def test_rays_hit_sheared_lamps_as_in_mitsuba() -> None:
+    """A square that is turned in its plane and then stretched is a parallelogram."""
+    transform = mi.ScalarTransform4f()
+    down = transform.translate([0, 0, 1]) @ transform.rotate([1, 0, 0], 180)
+    pose = down @ transform.scale([1, 0.3, 1]) @ transform.rotate([0, 0, 1], 40)
+    scene = mi.load_dict(
+        {"type": "scene", "lamp": {"type": "rectangle", "to_world": pose, "emitter": {"type": "area"}}}
+    )
+    rng, count = np.random.default_rng(5), 2000
+    direction = np.append(rng.uniform(-1.5, 1.5, (2, count)), np.ones((1, count)), axis=0)
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0), dr.normalize(mi.Vector3f(direction.astype(np.float32))))
+    si = receiver(dr.zeros(mi.Point3f, count), mi.Vector3f(0, 0, 1))
+    radiance, density = Emitters(scene, (0, 0, 0)).emission(scene, si, ray, dr.full(mi.Bool, True, count))
+    hit = np.array(scene.ray_intersect(ray).is_valid())
+    np.testing.assert_array_equal(np.array(radiance)[0] > 0, hit)
+    # The sampling density integrates to 1 over the lamp; dw = cos^3 du dv over slopes.
+    cosine = np.array(ray.d)[2]
+    assert 9 * np.mean(np.array(density) * cosine**3) == pytest.approx(1, rel=0.1)

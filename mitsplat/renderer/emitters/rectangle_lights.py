@@ -48,6 +48,8 @@ class Rectangles:
                 return None
             pose = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
             across, up, middle = 2 * pose[:3, 0], 2 * pose[:3, 1], pose[:3, 3]
+            if abs(across @ up) > 1e-4 * np.linalg.norm(across) * np.linalg.norm(up):  # a parallelogram
+                return None
             normal = np.linalg.inv(pose[:3, :3])[2]
             normal *= np.linalg.norm(np.cross(across, up)) / np.linalg.norm(normal)
             normal *= -1 if shape.has_flipped_normals() else 1

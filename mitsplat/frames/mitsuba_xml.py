@@ -13,17 +13,18 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import trimesh
 
 from mitsplat.arrays import ByteImage
-from mitsplat.asset import Asset
 from mitsplat.engine.answers import LostWorkersError
 from mitsplat.engine.pool import run_in_process
 from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.light_properties import light_properties
-from mitsplat.frames.scene_builder import asset_properties
+from mitsplat.frames.scene_builder import NO_SPLATS, asset_properties
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.gaussians.material_files import write_materials
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note
 from mitsplat.renderer.layers import describe_sensor
@@ -72,7 +73,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
         },
         "sensor": describe_sensor(plan.camera),
         **_export_assets(scene, layout, files),
-        **_export_visible_shapes(scene, plan, files),
+        **_export_shapes(scene, plan, files),
         **lights,
     }
     _register_plugin_kinds()
@@ -85,11 +86,12 @@ def _export_assets(scene: Scene, layout: Layout, folder: Path) -> MitsubaDict:
     """Write the splats and meshes of environment and objects; return the Mitsuba dictionaries of their shapes."""
     environment, shapes = scene.environment_of(layout.index), {}
     if environment is not None:
-        files = _write_asset(environment, folder, "environment")
+        files = _write_splats(environment.splats, environment.mesh, folder, "environment")
         shapes["environment"] = {"type": "splats", **files, **asset_properties(environment, 0)}
     # File names use positions, because asset names may repeat and need not be valid file names.
     used = {instance.asset for instance in layout.instances}
-    asset_files = {number: _write_asset(scene.assets[number], folder, f"object_{number}") for number in used}
+    assets = {number: scene.assets[number] for number in used}
+    asset_files = {n: _write_splats(asset.splats, asset.mesh, folder, f"object_{n}") for n, asset in assets.items()}
     appearances = draw_appearances(scene, layout)
     for instance in layout.instances:
         asset, appearance = scene.assets[instance.asset], appearances.get(instance.id)
@@ -102,12 +104,12 @@ def _export_assets(scene: Scene, layout: Layout, folder: Path) -> MitsubaDict:
     return shapes
 
 
-def _write_asset(asset: Asset, folder: Path, name: str) -> dict[str, str]:
-    """Write splats, materials and mesh of an asset; return their file properties for the shape plugin ``splats``."""
-    asset.splats.save(folder / f"{name}.ply")
-    files, mesh = {"filename": f"{folder.name}/{name}.ply"}, asset.mesh
-    if asset.splats.materials is not None:
-        write_materials(asset.splats.materials, folder / f"{name}_materials.ply")
+def _write_splats(splats: Splats, mesh: trimesh.Trimesh | None, folder: Path, name: str) -> dict[str, str]:
+    """Write splats, their materials and mesh; return their file properties for the shape plugin ``splats``."""
+    splats.save(folder / f"{name}.ply")
+    files = {"filename": f"{folder.name}/{name}.ply"}
+    if splats.materials is not None:
+        write_materials(splats.materials, folder / f"{name}_materials.ply")
         files["materials"] = f"{folder.name}/{name}_materials.ply"
     if mesh is not None:
         write_file(folder / f"{name}_proxy.ply", lambda part: mesh.export(part, file_type="ply"))
@@ -115,17 +117,19 @@ def _write_asset(asset: Asset, folder: Path, name: str) -> dict[str, str]:
     return files
 
 
-def _export_visible_shapes(scene: Scene, plan: FramePlan, folder: Path) -> MitsubaDict:
-    """Write the meshes and patterns of visible shapes; return their Mitsuba dictionaries."""
+def _export_shapes(scene: Scene, plan: FramePlan, folder: Path) -> MitsubaDict:
+    """Write the meshes and patterns of visible shapes, and the proxies; return their Mitsuba dictionaries."""
     surroundings, shapes = draw_surroundings(scene.spec, plan.index), {}
     for placed in placed_shapes(scene, plan.layout):
-        if (shape := placed.shape).visible:
-            name = f"shape_{placed.number}"
+        name, shape = f"shape_{placed.number}", placed.shape
+        if shape.visible:
             drawn, belt = surroundings.material_of(shape), plan.belt
             image = texture_image(drawn, scene.images)
             travel = belt.travel if belt is not None and shape.box == belt.box else 0.0
             made = finished_mesh(placed.stated, shape, drawn, image, travel=travel, motion=placed.motion)
             shapes[name] = _write_shape(made, drawn, image, folder, name)
+        elif shape.proxy:
+            shapes[name] = {"type": "splats", **_write_splats(NO_SPLATS, placed.mesh, folder, name)}
     return shapes
 
 

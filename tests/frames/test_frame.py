@@ -196,6 +196,28 @@ def test_exported_xml_renders_the_same_picture(
     assert np.abs(ours - develop(frame.rgb, {}))[covered].mean() < 1.0
 
 
+def test_exported_xml_has_the_proxies_of_invisible_shapes(
+    write_scene: WriteScene,
+    scene_data: dict[str, Any],
+    settled: dict[str, Any],
+    tmp_path: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A wall beside the region, which only casts shadows, hides the lamp from the middle of the table."""
+    wall = {"name": "wall", "box": {"size": [0.02, 1, 0.6], "position": [0.3, 0, 0.3]}, "proxy": True}
+    scene = ms.load_scene(write_scene({**scene_data, "shapes": [*scene_data["shapes"], wall]}))
+    layout = layout_of_small_scene(scene, settled)
+    monkeypatch.setattr("mitsplat.frames.mitsuba_xml.settle_layout", lambda *_: layout)
+    export_xml(scene, 1, tmp_path / "one.xml")
+    exported, frame = mi.load_file(str(tmp_path / "one.xml")), ms.render_frame(scene, 1, layout=layout)
+    image = np.array(exported.integrator().render(exported, exported.sensors()[0]))
+    depth, light = (
+        image[..., 4 + exported.integrator().aov_names().index(name)] for name in ("proxy.depth", "light.R")
+    )
+    np.testing.assert_allclose(depth, frame.layers.proxy_depth, atol=1e-4)
+    assert np.mean(np.abs(light - frame.layers.light[..., 0])) < 0.01  # another seed
+
+
 def test_invalid_xml_is_refused_in_one_sentence(tmp_path: Any) -> None:
     (tmp_path / "bad.xml").write_text('<scene version="3.0.0"><shape type="splats"/></scene>')
     with pytest.raises(InputError, match="filename"):

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from mitsplat.asset import Asset
 from mitsplat.cli import app
 from mitsplat.errors import InputError
-from mitsplat.frames.mitsuba_xml import _write_asset, describe_error, render_xml
+from mitsplat.frames.mitsuba_xml import _write_splats, describe_error, render_xml
 from mitsplat.frames.untrusted_xml import check_xml
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.runtime.variant import ensure_variant
@@ -165,7 +165,7 @@ def test_splats_have_the_materials_of_a_file_or_one_material(small: Path) -> Non
     nut = replace(Asset.load(small / "nut"), name="shiny")
     varied = SplatMaterials.uniform(len(nut.splats), metallic=1.0, roughness=0.2)
     (small / "files").mkdir()
-    files = _write_asset(replace(nut, splats=replace(nut.splats, materials=varied)), small / "files", "shiny")
+    files = _write_splats(replace(nut.splats, materials=varied), nut.mesh, small / "files", "shiny")
     shape = '<shape type="splats"> {} </shape>'
     strings = "".join(f'<string name="{name}" value="{value}"/>' for name, value in files.items())
     file = f'<string name="filename" value="{files["filename"]}"/>'

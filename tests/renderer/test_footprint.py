@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
+from scipy.ndimage import binary_dilation
 
 from mitsplat.arrays import Float32Array
 from mitsplat.gaussians.splat_materials import SplatMaterials
@@ -145,6 +146,33 @@ def test_ridges_finer_than_a_pixel_have_the_mean_light_of_its_points(monkeypatch
         twin = np.mean([fine[:, y, :, x] for x, y in at], axis=0)[inner, inner]
         assert np.sqrt(np.mean((getattr(own, name)[inner, inner] - twin) ** 2)) < noise
         assert np.sqrt(np.mean((getattr(middles, name)[inner, inner] - twin) ** 2)) > 4 * noise
+
+
+def test_meshes_beside_an_object_have_the_mean_light_of_their_points() -> None:
+    """The shadow of a plate covers parts of the pixels of the mesh along its edges."""
+    make_integrator()
+    turn = trimesh.transformations.rotation_matrix(np.radians(10), [0, 0, 1])
+    plate = trimesh.creation.box(bounds=[[-0.1, -0.1, 0.01], [0.1, 0.1, 0.012]])
+    shapes = {
+        "mesh": {"type": "rectangle"},
+        "plate": make_splats_shape(floor(0.097, z=0.012), turn, plate, instance=1, capture_light="uniform"),
+        "lamp": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().look_at(origin=[3, 1, 3], target=[0, 0, 0], up=[0, 0, 1]).scale(0.1),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 2000.0}},
+        },
+    }
+    own, large = (render(shapes, down_camera(size=zoom * SIZE), samples=RAYS) for zoom in (1, FINER))
+    fine, on_mesh = (
+        values.reshape(SIZE, FINER, SIZE, FINER) for values in (large.light[..., 0], large.proxy_instance == 0)
+    )
+    at = [tuple(int(FINER * (0.5 + v)) for v in offset) for offset in OFFSETS]
+    valid = np.array([on_mesh[:, y, :, x] for x, y in at])
+    twin = np.sum([fine[:, y, :, x] for x, y in at], axis=0, where=valid) / np.maximum(valid.sum(axis=0), 1)
+    is_mesh = own.instance == 0
+    beside = is_mesh & binary_dilation(~is_mesh, np.ones((3, 3))) & (own.proxy_instance == 0) & valid.any(axis=0)
+    assert beside.sum() > 50
+    assert np.sqrt(np.mean((own.light[..., 0] - twin)[beside] ** 2)) < 0.1  # 0.15 with light at the centres
 
 
 def test_pixels_without_similar_neighbours_get_the_saved_rays() -> None:

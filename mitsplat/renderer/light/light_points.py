@@ -205,8 +205,7 @@ def _bends(here: LitSurface, index: mi.UInt32, place: mi.UInt32, view: CameraVie
         same = dr.gather(mi.Float, here.trait, other, lit) == here.trait
         even = dr.dot(dr.gather(mi.Vector3f, here.normal, other, lit), here.normal) > EVEN
         bends |= (lit & ~same) | (inside & thing & ~(lit & even))
-    # Among static shapes, only splats have proxies for further rays.
-    bends &= here.known & here.valid & (thing | ~here.relit)
+    bends &= here.known & here.valid
     dr.eval(bends)
     return bends
 

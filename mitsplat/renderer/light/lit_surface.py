@@ -129,14 +129,17 @@ class VisibleSurfaces:
     def at_offset(self, pixel: mi.UInt32, offset: mi.Point2f) -> LitSurface:
         """Return the points at ``offset`` [px] (Point2f) from pixel centres.
 
-        A point is valid where the ray hits a proxy of the same instance.
+        A point is valid where the ray hits a proxy of the same instance or, at instance 0, a visible mesh.
         """
         row = pixel // self.view.width
         x, y = mi.Float(pixel - row * self.view.width) + 0.5, mi.Float(row) + 0.5
         rays = self.view.rays_through(x + offset.x, y + offset.y)
-        hit, static = self.proxies.nearest(rays)
-        dr.eval(hit, static)
-        surface = self._surface(replace(gathered(self.seen, pixel), direction=rays.d), hit, static)
+        seen, (hit, _) = gathered(self.seen, pixel), self.proxies.nearest(rays)
+        # Hits on visible meshes have the normals of triangles.
+        smooth = dr.select(seen.mesh, dr.gather(mi.Normal3f, self.static.normal, pixel), hit.normal)
+        hit = replace(hit, normal=smooth)
+        dr.eval(hit)
+        surface = self._surface(replace(seen, direction=rays.d), hit, hit)
         surface.valid &= mi.Float(hit.instance) == surface.instance
         dr.eval(surface)
         return surface

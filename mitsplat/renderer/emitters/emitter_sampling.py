@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -258,9 +259,13 @@ class Emitters:
             _, total = dr.while_loop(state, lambda i, _: active & (i < rounds), add, label="open light")
             total /= dr.opaque(mi.Float, number)
         if self.sky is not None:
-            emitter = dr.gather(mi.EmitterPtr, self.pointers, self.sky)
-            total += dr.pi * self.sky_colour if self.even_sky else sky_irradiance(emitter).at(si.n, active)
+            total += dr.pi * self.sky_colour if self.even_sky else self._sky_irradiance.at(si.n, active)
         return total
+
+    @cached_property
+    def _sky_irradiance(self) -> SkyIrradiance:
+        """Irradiance of the sky by normal."""
+        return sky_irradiance(dr.gather(mi.EmitterPtr, self.pointers, self.sky))
 
 
 class _DiscreteDistribution:

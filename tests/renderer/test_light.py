@@ -94,6 +94,17 @@ def test_an_occluder_hides_the_sky_within_its_reach_only() -> None:
             assert render({**shapes, "sun": sun}, camera, sky_reach=reach).light.max() == 0
 
 
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_relit_surroundings_have_the_normals_of_their_proxy(dynamic: bool) -> None:
+    """A floor below a point light of intensity I at the height h has the irradiance I / h^2, seen from any side."""
+    make_integrator()
+    ground = make_splats_shape(floor(), proxy=slab(), capture_light="uniform", dynamic=dynamic)
+    lamp = {"type": "point", "position": [0.0, 0.0, 2.0], "intensity": {"type": "rgb", "value": 5.0}}
+    camera = Camera.look_at((1.5, 0, 0.5), (0, 0, 0), width=32, height=32, fov_x=4)
+    light = render({"floor": ground, "lamp": lamp}, camera, white=np.pi, bounce=False).light
+    np.testing.assert_allclose(light, 5 / 4 / np.pi, rtol=0.03)
+
+
 def test_an_object_before_a_point_light_leaves_no_light() -> None:
     make_integrator()
     blocker = trimesh.creation.box(bounds=[[-0.05, -0.05, 0.4], [0.05, 0.05, 0.41]])

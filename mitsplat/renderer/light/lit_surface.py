@@ -108,7 +108,7 @@ class VisibleSurfaces:
         eye: Origin of the camera rays.
         seen: Primary visibility of all pixels.
         hit: First proxy hit of the camera rays.
-        static: First hit of the camera rays on static proxies.
+        static: First hit of the camera rays without dynamic objects.
     """
 
     traits: Traits

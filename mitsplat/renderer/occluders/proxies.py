@@ -184,6 +184,9 @@ class Proxies:
         """
         self.static = TraceScene.build([o for o in occluders if not o.dynamic])
         self.dynamic = TraceScene.build([o for o in occluders if o.dynamic], visible)
+        self._surroundings = self.static
+        if any(o.dynamic and o.instance == 0 for o in occluders):
+            self._surroundings = TraceScene.build([o for o in occluders if not o.dynamic or o.instance == 0])
         self.captured, self.reflecting = self.static, self.dynamic
         if any(not o.dynamic and o.splats is not None for o in occluders):
             self.captured = TraceScene.build([o for o in occluders if o.is_captured])
@@ -204,10 +207,10 @@ class Proxies:
         return self.shadow_casters if self.static is None else (self.static, *self.shadow_casters)
 
     def nearest(self, ray: mi.Ray3f) -> tuple[Hit, Hit]:
-        """Return the first hits of rays, and the first hits without the dynamic proxies."""
-        static = Hit.miss() if self.static is None else self.static.nearest(ray, Hit.miss())
-        dr.eval(static)  # a separate kernel, see `separate_kernels`
-        return static if self.dynamic is None else self.dynamic.nearest(ray, static), static
+        """Return the first hits of rays, and the first hits without the dynamic objects and visible shapes."""
+        ground = Hit.miss() if self._surroundings is None else self._surroundings.nearest(ray, Hit.miss())
+        dr.eval(ground)  # a separate kernel, see `separate_kernels`
+        return ground if self.dynamic is None else self.dynamic.nearest(ray, ground), ground
 
     def blocked(self, ray: mi.Ray3f) -> mi.Bool:
         """Return True for rays that hit a proxy before their end."""

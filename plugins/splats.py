@@ -137,7 +137,7 @@ class SplatsShape(mi.Mesh):
                     "shape 'splats': 'asset' takes the place of 'filename', 'materials', 'proxy' and 'units'"
                 )
             path, _ = _stamp(folder, ASSET_FILE)
-            asset = _load_asset(path, max(file.stat().st_mtime_ns for file in path.parent.iterdir()))
+            asset = _load_asset(path, frozenset((file, file.stat().st_mtime_ns) for file in path.parent.iterdir()))
             splats, proxy = asset.splats, asset.mesh
         if is_uniform and (splats is not None or materials_file):
             raise InputError("shape 'splats': 'metallic' needs 'filename', and no 'materials'")
@@ -265,7 +265,7 @@ def _refuse_other_units(path: Path) -> None:
 
 
 @lru_cache(maxsize=64)
-def _load_asset(path: Path, _modified: int) -> Asset:
+def _load_asset(path: Path, _modified: frozenset[tuple[Path, int]]) -> Asset:
     asset = Asset.load(path.parent)
     if asset.units == "unknown":
         raise InputError(f"shape 'splats': {path}: units are unknown: give it a size [m]")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -158,6 +159,17 @@ def test_an_asset_shape_has_metres_mesh_and_material(small: Path) -> None:
         np.testing.assert_allclose(shape.proxy.bounds @ at[:3, :3].T, nut.mesh.bounds, atol=1e-5)
     assert [s.capture_light for s in shapes] == ["uniform", "uniform", "uniform", "scene"]
     assert [s.specular for s in shapes] == pytest.approx([0, 0.04, 0.04, 0])
+
+
+def test_an_asset_with_a_replaced_file_is_read_again(small: Path) -> None:
+    """The other file is older, as after a copy that preserves times."""
+    ensure_variant()
+    description = {"type": "splats", "asset": str(small / "nut")}
+    before = mi.load_dict(description).splats
+    half = before.select(np.arange(len(before) // 2))
+    half.save(small / "nut/splats.ply")
+    os.utime(small / "nut/splats.ply", (1, 1))
+    assert len(mi.load_dict(description).splats) == len(half)
 
 
 def test_splats_have_the_materials_of_a_file_or_one_material(small: Path) -> None:

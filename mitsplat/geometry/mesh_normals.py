@@ -13,6 +13,8 @@ CREASE_ANGLE = np.radians(28.0)
 """Dihedral angle above which an edge is a crease [rad]. Gaussians must not cross creases; normals are not smoothed
 there.
 """
+_PLANE = 1e-3
+"""Maximum angle between the faces of a plane facet [rad]."""
 
 NOISE_CREASE = 10.0
 """Dihedral angle of a crease over the lower quartile of a mesh's dihedral angles. The quartile is zero for CAD meshes,
@@ -24,7 +26,10 @@ SHARPEST = np.radians(80.0)
 
 
 def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE) -> Float64Array:
-    """Return area-weighted unit normals (F, 3, 3) at the corners of faces, smooth except across creases.
+    """Return unit normals (F, 3, 3) at the corners of faces, smooth except across creases.
+
+    Normals are weighted by the areas of plane facets. Large plane faces therefore keep their own normal, and the result
+    does not depend on the diagonals that divide a facet into triangles.
 
     Args:
         mesh: The mesh.
@@ -36,10 +41,11 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE)
     alike = np.einsum("pd,pd->p", mesh.face_normals[pairs.row], mesh.face_normals[pairs.col]) > np.cos(crease_angle)
     row, col = pairs.row[alike], pairs.col[alike]
     normals = np.zeros((len(mesh.faces), 3, 3))
-    weighted = mesh.face_normals * mesh.area_faces[:, None]
+    weights = _facet_weights(mesh)
     for k in range(3):
-        shares = (mesh.faces[col] == mesh.faces[row, k][:, None]).any(axis=1)
-        np.add.at(normals[:, k], row[shares], weighted[col[shares]])
+        shared = mesh.faces[col] == mesh.faces[row, k][:, None]
+        share = np.einsum("pk,pk->p", shared, weights[col])
+        np.add.at(normals[:, k], row, share[:, None] * mesh.face_normals[col])
     length = np.linalg.norm(normals, axis=2, keepdims=True)
     flat = _flat_normals(mesh)[corner].reshape(-1, 3, 3)
     return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-30), flat))
@@ -57,6 +63,15 @@ def smooth_normals(mesh: trimesh.Trimesh) -> Float64Array:
     lengths = np.cumsum(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)[order])
     usual = angles[order[np.searchsorted(lengths, 0.25 * lengths[-1])]] if len(order) else 0.0
     return corner_normals(mesh, crease_angle=float(np.clip(NOISE_CREASE * usual, CREASE_ANGLE, SHARPEST)))
+
+
+def _facet_weights(mesh: trimesh.Trimesh) -> Float64Array:
+    """Return weights (F, 3) of faces at their corners, whose sums over the faces of a plane facet are its area."""
+    plane = mesh.face_adjacency[mesh.face_adjacency_angles < _PLANE]
+    facet = trimesh.graph.connected_component_labels(plane, node_count=len(mesh.faces))
+    area = np.bincount(facet, mesh.area_faces)
+    _, corner, count = np.unique(mesh.faces * len(area) + facet[:, None], return_inverse=True, return_counts=True)
+    return np.asarray(area[facet][:, None] / count[corner].reshape(-1, 3))
 
 
 def _flat_normals(mesh: trimesh.Trimesh) -> Float64Array:

@@ -237,6 +237,15 @@ def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box() -> None:
     )
 
 
+@pytest.mark.parametrize("sections", [24, 64])
+def test_normals_of_a_cylinder_do_not_follow_the_diagonals_of_its_facets(sections: int) -> None:
+    """The normal at a vertex of the lateral surface is radial."""
+    tube = trimesh.creation.cylinder(0.01, 0.04, sections=sections)
+    lateral = np.abs(tube.face_normals[:, 2]) < 0.5
+    radial = tube.triangles[lateral] * (100.0, 100.0, 0.0)
+    np.testing.assert_allclose(corner_normals(tube)[lateral], radial, atol=1e-6)
+
+
 def test_degenerate_triangles_get_normals() -> None:
     """CAD files have many degenerate triangles. A ray that hits one without a normal would give NaN and no splats."""
     corners = np.array([(0, 0, 0), (0.01, 0, 0), (0.005, 1e-13, 0), (0.005, 0, 0.01)])

@@ -13,6 +13,11 @@ CREASE_ANGLE = np.radians(28.0)
 """Dihedral angle above which an edge is a crease [rad]. Gaussians must not cross creases; normals are not smoothed
 there.
 """
+_MAX_SAGITTA = 1 / 200
+"""Distance between two facets and a curved surface that both approximate, relative to the longest extent of the mesh,
+above which the facets are plane faces: ten times the default tolerance of the facets of STEP files.
+"""
+
 _PLANE = 1e-3
 """Maximum angle between the faces of a plane facet [rad]."""
 
@@ -31,14 +36,23 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE)
     Normals are weighted by the areas of plane facets. Large plane faces therefore keep their own normal, and the result
     does not depend on the diagonals that divide a facet into triangles.
 
+    Two large faces at a small angle, such as a roof and a wide chamfer, are plane: a curved surface with facets that
+    wide would be too coarse. Facets of width w at an angle a are w a / 8 away from the arc through their edges.
+
     Args:
         mesh: The mesh.
-        crease_angle: Dihedral angle above which an edge is a crease [rad].
+        crease_angle: Dihedral angle above which an edge is a crease [rad]. Above the default, which is for rough
+            surfaces, large faces are smooth too.
     """
     corner = np.repeat(np.arange(len(mesh.faces)), 3)
     incidence = mesh.faces_sparse.astype(np.float64)
     pairs = (incidence.T @ incidence).tocoo()
-    alike = np.einsum("pd,pd->p", mesh.face_normals[pairs.row], mesh.face_normals[pairs.col]) > np.cos(crease_angle)
+    cosine = np.einsum("pd,pd->p", mesh.face_normals[pairs.row], mesh.face_normals[pairs.col])
+    alike = cosine > np.cos(crease_angle)
+    if crease_angle <= CREASE_ANGLE and len(mesh.faces):
+        width, angle = _widths(mesh), np.arccos(cosine.clip(-1, 1))
+        sagitta = np.minimum(width[pairs.row], width[pairs.col]) * angle / 8
+        alike &= sagitta <= _MAX_SAGITTA * mesh.extents.max()
     row, col = pairs.row[alike], pairs.col[alike]
     normals = np.zeros((len(mesh.faces), 3, 3))
     weights = _facet_weights(mesh)
@@ -72,6 +86,12 @@ def _facet_weights(mesh: trimesh.Trimesh) -> Float64Array:
     area = np.bincount(facet, mesh.area_faces)
     _, corner, count = np.unique(mesh.faces * len(area) + facet[:, None], return_inverse=True, return_counts=True)
     return np.asarray(area[facet][:, None] / count[corner].reshape(-1, 3))
+
+
+def _widths(mesh: trimesh.Trimesh) -> Float64Array:
+    """Return the smallest heights (F,) of faces."""
+    edges = mesh.triangles - np.roll(mesh.triangles, 1, axis=1)
+    return np.asarray(2 * mesh.area_faces / np.maximum(np.linalg.norm(edges, axis=2).max(axis=1), 1e-300))
 
 
 def _flat_normals(mesh: trimesh.Trimesh) -> Float64Array:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -244,6 +245,23 @@ def test_normals_of_a_cylinder_do_not_follow_the_diagonals_of_its_facets(section
     lateral = np.abs(tube.face_normals[:, 2]) < 0.5
     radial = tube.triangles[lateral] * (100.0, 100.0, 0.0)
     np.testing.assert_allclose(corner_normals(tube)[lateral], radial, atol=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [10.0, 25.0])
+def test_plane_faces_of_a_roof_keep_their_normals(degrees: float) -> None:
+    rise = 0.03 * np.tan(np.radians(degrees / 2))
+    outline = [(-0.03, 0), (0.03, 0), (0.03, 0.01), (0, 0.01 + rise), (-0.03, 0.01)]
+    roof = trimesh.creation.extrude_polygon(shapely.Polygon(outline), 0.06)
+    np.testing.assert_allclose(corner_normals(roof), np.repeat(roof.face_normals[:, None], 3, axis=1), atol=1e-6)
+
+
+def test_a_wide_chamfer_does_not_bend_the_plane_beside_it() -> None:
+    height = 0.01 + 0.008 * np.tan(np.radians(25))
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    rings = [np.c_[edge * corners, [z] * 4] for edge, z in ((0.03, 0), (0.03, 0.01), (0.022, height))]
+    plate = trimesh.convex.convex_hull(np.concatenate(rings))
+    sharp = np.repeat(plate.face_normals[:, None], 3, axis=1)
+    np.testing.assert_allclose(corner_normals(plate), sharp, atol=1e-6)
 
 
 def test_degenerate_triangles_get_normals() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import mitsuba as mi
 import numpy as np
@@ -10,12 +11,15 @@ import numpy.typing as npt
 import pytest
 import trimesh
 from scipy.ndimage import binary_erosion
+from scipy.spatial.transform import Rotation
 
+from mitsplat.bake import BakeSettings, SurfaceFinish, bake_asset
 from mitsplat.gaussians.spherical_harmonics import SH_C0
+from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
-from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
 from tests.renderer.test_light import WHITE_SKY, nothing
 
 Array = npt.NDArray[np.float64]
@@ -110,3 +114,43 @@ def test_round_metal_mirrors_a_border_as_sharp_and_bright_as_exact(kind: str, ro
     assert seen.mean() == pytest.approx(light.mean(), rel=0.01)
     assert np.sqrt(np.mean((seen - light)[border] ** 2)) < largest
     assert np.sqrt(np.mean((seen - light)[~border] ** 2)) < 0.01
+
+
+BOX = trimesh.creation.box((1, 1, 0.4))
+
+
+@cache
+def _baked_box() -> Splats:
+    settings = BakeSettings(gaussians=1500, fit_steps=0, verify_views=0)
+    finish = SurfaceFinish(colour="white", metallic=1.0, roughness=0.2)
+    return bake_asset(BOX, name="box", settings=settings, finish=finish).asset.splats
+
+
+def box_of_metal(radiance: float, *, mapped: bool) -> Layers:
+    """Render a box of rough metal whose faces mirror no light, with a lamp beside the camera.
+
+    Args:
+        radiance: Radiance of the lamp [W/(m^2 sr)].
+        mapped: True if the splats state the normals of the faces as shading normals.
+    """
+    make_integrator()
+    splats = _baked_box()
+    if mapped:
+        outward = Rotation.from_quat(splats.quats).as_matrix()[:, :, 2]
+        splats = replace(splats, materials=replace(splats.materials, normals=outward))
+    lamp = mi.ScalarTransform4f().look_at([0, -5, 5], [0, 0, 0], [0, 0, 1]) @ mi.ScalarTransform4f().scale(0.5)
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "box": make_splats_shape(splats, proxy=BOX, instance=1),
+            "light": {"type": "rectangle", "to_world": lamp, "emitter": emitter},
+        }
+    )
+    camera = Camera.look_at((0.2, -3, 2.9), (0, 0, 0), width=120, height=90, fov_x=25)
+    return render_layers(make_integrator(white=float(np.pi), hide_emitters=True), scene, camera)
+
+
+def test_outlines_of_metal_do_not_mirror_a_lamp_beside_the_camera() -> None:
+    """Splats reach beyond their proxy. There, they have the normal of the nearest face, not that of the view."""
+    assert box_of_metal(50.0, mapped=False).rgb.max() < 0.3

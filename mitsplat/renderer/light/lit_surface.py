@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +18,11 @@ from mitsplat.renderer.rays.device_arrays import gathered
 AGREEMENT = 0.02
 """Largest distance of a splat in front of its proxy, as a share of the depth, at which the proxy's surface is used."""
 
+
+_AROUND = [
+    (x * distance, y * distance) for distance in (1, 2, 3, 4, 6, 8) for x, y in product((-1, 0, 1), repeat=2) if x or y
+]
+"""Steps to the pixels [px] at which a pixel beside a proxy looks for it, the nearest first."""
 
 MAX_METALLIC = 0.99
 """Metalness above which diffuse light is not traced."""
@@ -124,7 +131,33 @@ class VisibleSurfaces:
 
         They lie on the proxy where it agrees with the visible depth, and otherwise at that depth.
         """
-        return self._surface(gathered(self.seen, pixel), gathered(self.hit, pixel), gathered(self.static, pixel))
+        hit, static = (gathered(hits, pixel) for hits in (self.hit, self.static))
+        beside = gathered(self.hit, dr.gather(mi.UInt32, self._nearest, pixel))
+        return self._surface(gathered(self.seen, pixel), hit, static, beside)
+
+    @cached_property
+    def _nearest(self) -> mi.UInt32:
+        """Nearest pixels whose rays hit the proxy of the object that the pixels show; the pixels themselves if none.
+
+        Splats reach beyond the edges of their proxy by a part of a pixel.
+        """
+        width, height, instance = self.view.width, self.view.height, self.seen.instance
+        nearest = dr.arange(mi.UInt32, width * height)
+        dr.eval(nearest)
+        own = dr.compress((instance > 0) & (self.hit.instance != instance))
+        if not dr.width(own):
+            return nearest
+        thing, found, done = dr.gather(mi.UInt32, instance, own), mi.UInt32(own), mi.Bool(False)
+        column, row = mi.Int32(own % width), mi.Int32(own // width)
+        for dx, dy in _AROUND:
+            x, y = column + dx, row + dy
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & ~done
+            other = mi.UInt32(y * width + x)
+            hits = inside & (dr.gather(mi.UInt32, self.hit.instance, other, inside) == thing)
+            found, done = dr.select(hits, other, found), done | hits
+        dr.scatter(nearest, found, own, mode=dr.ReduceMode.Permute)
+        dr.eval(nearest)
+        return nearest
 
     def at_offset(self, pixel: mi.UInt32, offset: mi.Point2f) -> LitSurface:
         """Return the points at ``offset`` [px] (Point2f) from pixel centres.
@@ -139,12 +172,13 @@ class VisibleSurfaces:
         smooth = dr.select(seen.mesh, dr.gather(mi.Normal3f, self.static.normal, pixel), hit.normal)
         hit = replace(hit, normal=smooth)
         dr.eval(hit)
-        surface = self._surface(replace(seen, direction=rays.d), hit, hit)
+        surface = self._surface(replace(seen, direction=rays.d), hit, hit, hit)
         surface.valid &= mi.Float(hit.instance) == surface.instance
         dr.eval(surface)
         return surface
 
-    def _surface(self, seen: VisiblePixels, hit: Hit, static: Hit) -> LitSurface:
+    def _surface(self, seen: VisiblePixels, hit: Hit, static: Hit, beside: Hit) -> LitSurface:
+        """Return the points of rays; ``beside`` has the surface of objects whose proxy the ray misses."""
         ray, depth, instance = mi.Ray3f(self.eye, seen.direction), seen.depth, seen.instance
         cosine = self.view.cosine(ray)
         met = hit.distance < dr.inf
@@ -157,6 +191,8 @@ class VisibleSurfaces:
         proxy_depth = dr.select(behind & ~raised, static.distance, hit.distance) * cosine
         shown = [dr.select(behind, getattr(static, name), getattr(hit, name)) for name in ("normal", "face", "lift")]
         towards = mi.Normal3f(-ray.d)
+        at_edge = ~same & ~behind & (beside.instance == instance)
+        normal, face = (dr.select(at_edge, getattr(beside, name), towards) for name in ("normal", "face"))
         # A splat inside its own coarse proxy would lie in the proxy's shadow, so it is lit at the surface of the proxy.
         on_proxy = same & (depth > (1 - AGREEMENT) * proxy_depth)
         z = dr.select(on_proxy, proxy_depth, depth)
@@ -168,8 +204,8 @@ class VisibleSurfaces:
         captured = dr.gather(mi.Bool, traits.captured, trait)
         roughness, metallic, specular = (
             dr.select(
-                same & ~captured,
-                dr.select(behind, getattr(static, name), getattr(hit, name)),
+                (same | at_edge) & ~captured,
+                dr.select(behind, getattr(static, name), dr.select(at_edge, getattr(beside, name), getattr(hit, name))),
                 dr.gather(mi.Float, getattr(traits, name), trait),
             )
             for name in ("roughness", "metallic", "specular")
@@ -179,8 +215,8 @@ class VisibleSurfaces:
         reach = dr.max(dr.abs(position))
         return LitSurface(
             position=position,
-            normal=self._shading_normal(seen, mi.Vector3f(dr.select(same, shown[0], towards))),
-            face=mi.Vector3f(dr.select(same, shown[1], towards)),
+            normal=self._shading_normal(seen, mi.Vector3f(dr.select(same, shown[0], normal))),
+            face=mi.Vector3f(dr.select(same, shown[1], face)),
             lift=dr.select(on_proxy, shown[2], 0),
             to_camera=-ray.d,
             offset=dr.fma(z, quarter, reach * 4e-6),

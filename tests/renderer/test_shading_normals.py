@@ -16,6 +16,7 @@ from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.composition.scene_contents import ContentsReader
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
+from tests.renderer.test_reflected_edges import box_of_metal
 
 PLATE = trimesh.creation.box(bounds=[(-1, -1, -0.1), (1, 1, 0)])
 TURN = Rotation.from_euler("z", 90, degrees=True).as_matrix()
@@ -79,3 +80,9 @@ def test_only_shapes_with_shading_normals_are_rendered_again(present: bool) -> N
     shape = make_splats_shape(_plate((0, 0, 1) if present else None), proxy=PLATE, instance=1)
     contents = ContentsReader().read(mi.load_dict({"type": "scene", "plate": shape}), splat_shadows=False)
     assert (contents.normal_mapped is not None) == present
+
+
+def test_shading_normals_of_plane_faces_leave_their_edges_as_they_are() -> None:
+    """Metal mirrors a lamp at an edge of a box only if one of its faces does, and not if their mean normal does."""
+    flat, shown = box_of_metal(50.0, mapped=False), box_of_metal(50.0, mapped=True)
+    np.testing.assert_allclose(shown.rgb, flat.rgb, atol=0.1)

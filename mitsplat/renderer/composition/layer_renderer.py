@@ -132,7 +132,7 @@ class LayerRenderer:
                 mesh,
                 metallic,
                 roughness,
-                self._shading_normals(contents, view, splat, z_max),
+                self._shading_normals(contents, view, hit, splat, z_max),
             )
             # Visible meshes receive light like static proxies, also where splats touch them.
             ground = meshes.before(static) if meshes else static
@@ -308,12 +308,12 @@ class LayerRenderer:
         return contents.mixed.materials(view, self.quality, hit, splat.instance, z_max)
 
     def _shading_normals(
-        self, contents: SceneContents, view: CameraView, splat: Image, z_max: mi.Float | None
+        self, contents: SceneContents, view: CameraView, hit: Hit, splat: Image, z_max: mi.Float | None
     ) -> mi.Vector3f:
         """Return shading normals that replace those of the proxies, zero elsewhere."""
         if contents.normal_mapped is None:
             return mi.Vector3f(0)
-        return contents.normal_mapped.normals(view, self.quality, splat, z_max)
+        return contents.normal_mapped.normals(view, self.quality, splat, hit, z_max)
 
     def _shape_votes(self, contents: SceneContents, view: CameraView, z_max: mi.Float | None) -> mi.UInt32 | None:
         """Return the shape of an instance that each pixel shows, or None if all its shapes are lit alike.

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from mitsplat.renderer.emitters.emitter_sampling import receiver
 from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies, TraceScene
+from mitsplat.renderer.rays.device_arrays import unit_float
 
 RICHTMYER = tuple(int(2**32 * (prime**0.5 % 1)) | 1 for prime in (2, 3, 5, 7, 11))
 """Additive recurrence with square roots of primes, in units of 2^-32 (Richtmyer 1951, "The evaluation of definite
@@ -97,4 +98,4 @@ def next_key(key: mi.UInt32) -> mi.UInt32:
 
 def sequence_number(key: mi.UInt32, dimension: int) -> mi.Float:
     """Return a number in [0, 1) per key: a coordinate of :data:`RICHTMYER`."""
-    return mi.Float((key * RICHTMYER[dimension]) >> 8) * 2.0**-24
+    return unit_float(key * RICHTMYER[dimension])

@@ -16,7 +16,7 @@ from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.materials.principled import power_weight, typical_brightness
 from mitsplat.renderer.occluders.proxies import OccluderScene, Proxies
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.rays.device_arrays import gathered, opaque_seed
+from mitsplat.renderer.rays.device_arrays import gathered, opaque_seed, unit_float
 
 ROBERTS = (3242174889, 2447445414)
 """Additive recurrence of the two-dimensional golden ratio in units of 2^-32 (Roberts 2018, "The unreasonable
@@ -286,7 +286,7 @@ def _shadow_ray(origin: mi.Vector3f, beam: Beam, offset: mi.Float) -> mi.Ray3f:
 
 def sequence_point(i: mi.UInt32, recurrence: tuple[int, int] = RECURRENCE) -> mi.Point2f:
     """Return point ``i`` of a low-discrepancy sequence with 24 bits of precision for every ``i``."""
-    return mi.Point2f(*[mi.Float((i * step) >> 8) * 2.0**-24 for step in recurrence])
+    return mi.Point2f(*[unit_float(i * step) for step in recurrence])
 
 
 def _bayer(x: mi.UInt32, y: mi.UInt32) -> mi.UInt32:

@@ -19,7 +19,7 @@ from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes, has_bsdf_flag
 from mitsplat.renderer.occluders.proxies import Proxies
 from mitsplat.renderer.projection.gaussian import srgb_to_linear
 from mitsplat.renderer.rays.camera_rays import CameraView
-from mitsplat.renderer.rays.device_arrays import gathered, opaque_seed
+from mitsplat.renderer.rays.device_arrays import gathered, opaque_seed, unit_float
 
 LANES = 1 << 20
 """Number of paths that are traced at once."""
@@ -284,7 +284,7 @@ class _RandomNumbers:
         """Return a random number in [0, 1)."""
         if depth == 0 and dimension < len(R7):
             shift = mi.sample_tea_32(self.pixel, self.seed + self._dimension(0, dimension), ROUNDS)[0]
-            return mi.Float((shift + self.number * R7[dimension]) >> 8) * 2.0**-24
+            return unit_float(shift + self.number * R7[dimension])
         own = mi.sample_tea_32(self.pixel, self.number + self.seed, ROUNDS)[0]
         return mi.sample_tea_float32(own, self._dimension(depth, dimension), ROUNDS)
 

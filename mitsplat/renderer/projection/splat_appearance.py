@@ -18,7 +18,7 @@ import numpy as np
 from mitsplat.arrays import Float32Array
 from mitsplat.renderer.projection.gaussian import linear_to_srgb, srgb_to_linear
 from mitsplat.renderer.projection.records import AppearanceRow
-from mitsplat.renderer.rays.device_arrays import wrapped
+from mitsplat.renderer.rays.device_arrays import unit_float, wrapped
 
 CELLS = 3.0
 """Cells of the coarsest noise along the longest side of an object."""
@@ -119,7 +119,7 @@ def _value_noise(point: mi.Vector3f, seed: mi.UInt32) -> mi.Float:
         for i, step, t, prime in zip(low, ahead, share, _PRIMES, strict=False):
             weight *= t if step else 1 - t
             key += mi.UInt32(i + step) * prime
-        total += weight * mi.Float(_hashed(key) >> 8) * 2.0**-24
+        total += weight * unit_float(_hashed(key))
     return total
 
 

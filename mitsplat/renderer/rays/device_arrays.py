@@ -52,6 +52,11 @@ def opaque_seed(seed: int) -> mi.UInt32:
     return dr.opaque(mi.UInt32, seed * 2654435761 % (1 << 32))
 
 
+def unit_float(bits: mi.UInt32) -> mi.Float:
+    """Return the leading 24 bits of integers as numbers in [0, 1)."""
+    return mi.Float(bits >> 8) * 2.0**-24
+
+
 def number(values: mi.Float, place: int) -> mi.Float:
     """Return one of the numbers of :func:`on_device`."""
     return dr.gather(mi.Float, values, place)

@@ -210,12 +210,12 @@ class Emitters:
         self, si: mi.SurfaceInteraction3f, index: mi.UInt32, point: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float, mi.Color3f, mi.Float]:
         """Return unit vector and distance [m] to points of emitters, radiance over density, and the density [1/sr]."""
-        if self.rectangles is None or not (self.sky is None or self.even_sky):
-            emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
-            sample, radiance = emitter.sample_direction(si, point, active)
-            density = dr.select(sample.delta, dr.inf, sample.pdf)
-            return mi.Vector3f(sample.d), sample.dist, dr.select(sample.pdf > 0, radiance, 0), density
-        return self.rectangles.towards(si.p, index, point)
+        if self.rectangles is not None and (self.sky is None or self.even_sky):
+            return self.rectangles.towards(si.p, index, point)
+        emitter = dr.gather(mi.EmitterPtr, self.pointers, index, active)
+        sample, radiance = emitter.sample_direction(si, point, active)
+        density = dr.select(sample.delta, dr.inf, sample.pdf)
+        return mi.Vector3f(sample.d), sample.dist, dr.select(sample.pdf > 0, radiance, 0), density
 
     @staticmethod
     def _sky_radiance(

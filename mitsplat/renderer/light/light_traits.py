@@ -79,10 +79,13 @@ class Traits:
             own = _Row.of(shape)
             key = shape.instance, own
             if key not in rows:
-                first = not any(instance == shape.instance for instance, _ in rows)
-                rows[key] = shape.instance if first else len(values)
-                values[rows[key] : rows[key] + 1] = [own]
-                owners[rows[key] : rows[key] + 1] = [shape.instance]
+                if any(instance == shape.instance for instance, _ in rows):
+                    rows[key] = len(values)
+                    values.append(own)
+                    owners.append(shape.instance)
+                else:
+                    rows[key] = shape.instance
+                    values[shape.instance] = own
             placed[i] = rows[key]
         relit, roughness, metallic, specular, captured = zip(*values, strict=True)
         several = len(values) > count

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -11,10 +13,11 @@ import trimesh
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import SplatMaterials
+from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.composition.scene_contents import ContentsReader
 from mitsplat.renderer.layers import make_integrator, make_splats_shape
-from mitsplat.renderer.materials.proxy_materials import corner_materials
+from mitsplat.renderer.materials.proxy_materials import corner_materials, material_triangles
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies, TraceScene
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 
@@ -96,6 +99,23 @@ def test_corners_of_a_coarse_mesh_have_the_mean_colour_of_many_gaussians() -> No
     sh = np.repeat((colours - 0.5)[:, None, None] / SH_C0, 3, axis=2)
     chequered = Splats(chequered.means, chequered.quats, chequered.scales, chequered.opacities, sh)
     assert np.abs(corner_materials(BOX, chequered)[:, :3] - 0.5).max() < 0.06
+
+
+def test_sides_of_a_thin_sheet_keep_their_materials() -> None:
+    """The Gaussians of the painted upper side are as near to the bare lower side as to each other."""
+    sheet = trimesh.creation.box((0.3, 0.2, 0.0005))
+    surfels = place_surfels(sheet, 1.0, 3000, np.random.default_rng(0))
+    is_top = surfels.normals[:, 2] > 0.5
+    splats = surfels.splats(np.where(is_top, -1.0, 1.0)[:, None, None] * np.ones((1, 1, 3)))
+    metal = SplatMaterials(np.where(is_top, 0.0, 1.0), np.where(is_top, 0.6, 0.3), np.where(is_top, 0.5, 0.0))
+    splats = replace(splats, materials=metal)
+    triangles = material_triangles(sheet, splats)
+    assert triangles is not None
+    corners = corner_materials(sheet, splats).reshape(len(triangles.face), 3, -1)
+    for normal, metallic in ((1, 0.0), (-1, 1.0)):
+        side = normal * sheet.face_normals[triangles.face, 2] > 0.5
+        inner = np.abs(triangles.interpolate(sheet.triangles)[side][..., :2]).max(axis=(1, 2)) < 0.08
+        np.testing.assert_allclose(corners[side][inner][..., 3], metallic, atol=0.01)
 
 
 def test_surfaces_without_splats_reflect_nothing() -> None:

@@ -225,8 +225,13 @@ def corner_materials(mesh: trimesh.Trimesh, splats: Splats | None) -> Float32Arr
     neighbours = min(int(np.clip(len(opaque) // count, least, NEIGHBOURS[1])), len(opaque))
     _, nearest = KDTree(splats.means[opaque]).query(places.reshape(-1, 3), range(1, neighbours + 1))
     axes = Rotation.from_quat(splats.quats[opaque]).as_matrix()
-    normals = np.take_along_axis(axes, splats.scales[opaque].argmin(axis=1)[:, None, None], axis=2)[..., 0]
+    shortest = splats.scales[opaque].argmin(axis=1)
+    normals = np.take_along_axis(axes, shortest[:, None, None], axis=2)[..., 0]
     agreement = np.einsum("nki,ni->nk", normals[nearest], np.repeat(facing, 3, axis=0))
+    if (
+        shortest == 2
+    ).all():  # surfels, whose third axis points outward: those of the other side of a sheet do not count
+        agreement = np.maximum(agreement, 0)
     weights = agreement**FACING + 1e-9
     if triangles is not None:
         weights *= _on_triangle(corners, splats, opaque[nearest])

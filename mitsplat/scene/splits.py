@@ -53,8 +53,6 @@ def _divide(number: int, share: float) -> tuple[bool, int]:
 
 def is_empty(spec: SceneSpec, layout: int) -> bool:
     """Return True if a layout has no labelled objects. Such layouts are evenly spread over each split."""
-    if not spec.empty:
-        return False
     split, rank = _place_in_split(layout, spec.output)
     phase = _phase(spec.seed, split)
     return math.floor((rank + 1) * spec.empty + phase) > math.floor(rank * spec.empty + phase)

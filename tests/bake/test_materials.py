@@ -20,6 +20,7 @@ from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.images.colour import decode_srgb
+from mitsplat.mesh_files.mesh_file import DIELECTRIC_SPECULAR, ROUGHNESS
 from mitsplat.mesh_files.trimesh_parts import read_material
 
 COLOUR = (200, 120, 40)
@@ -232,7 +233,10 @@ def test_a_given_finish_replaces_the_material_of_the_file(tmp_path: Path) -> Non
     assert part.specular == pytest.approx(decode_srgb(np.array(COLOUR) / 255).mean(), abs=0.01)
     part = part_of(tmp_path, "Kd 1 1 1\nPr 0.3", specular=0.0)
     assert (part.shiny, part.specular) == (False, 0.0)
-    assert part_of(tmp_path, "Kd 1 1 1", specular=0.08).specular == pytest.approx(0.08)
+    part = part_of(tmp_path, "Kd 1 1 1", specular=0.08)
+    assert (part.shiny, part.specular, part.roughness) == (True, pytest.approx(0.08), ROUGHNESS)
+    part = part_of(tmp_path, "Kd 1 1 1", roughness=0.3)
+    assert (part.shiny, part.specular, part.roughness) == (True, DIELECTRIC_SPECULAR, 0.3)
 
 
 @pytest.mark.parametrize(

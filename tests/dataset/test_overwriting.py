@@ -20,6 +20,7 @@ from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.frames.mitsuba_xml import render_xml
 from mitsplat.scene.loading.scene_loading import make_scene
 from mitsplat.scene.scene import Scene
+from mitsplat.scene.spec.scene_spec import FORMATS
 from tests.cli.typed import run
 from tests.conftest import BOTH, contents, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
@@ -95,6 +96,16 @@ def test_overwriting_keeps_files_of_other_programs(scene: Scene, tmp_path: Path)
     write(scene, out, overwrite=True)
     for name in ("colmap/database.db", "depth/a.png", "annotations/mine.json", "notes/.mine.part"):
         assert (out / name).exists()
+
+
+def test_overwriting_removes_the_files_of_all_formats(tmp_path: Path) -> None:
+    """Labels that remained would be read with those of the new dataset."""
+    formats = [name for name in FORMATS if name != "colmap"]
+    out = write(small_scene(tmp_path, large_boxes(), BOTH, layouts=2, views=2, formats=formats), tmp_path / "out")
+    assert {"yolo-obb", "bop", "flow"} <= {path.name for path in out.iterdir()}
+    scene = small_scene(tmp_path, large_boxes(), BOTH, layouts=1, views=1, formats=["yolo"])
+    write(scene, out, overwrite=True)
+    assert contents(out).keys() == contents(write(scene, tmp_path / "fresh")).keys()
 
 
 @pytest.mark.parametrize("text", ["\n", "{}", "[]", '{"index": 1, "instances": 3}'])

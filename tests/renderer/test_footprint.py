@@ -71,7 +71,10 @@ def test_rays_of_one_point_and_of_all_points_are_even(factors: npt.NDArray[np.in
     make_integrator()
     surface: Any = None
     points = LightPoints(surface, mi.UInt32([0] * 5), mi.UInt32([0]), mi.UInt32([0]), 1, 1)
-    start, step = (np.array(v, dtype=np.int64)[1:] for v in points.steps(dr.arange(mi.UInt32, 5)))
+    rows = dr.arange(mi.UInt32, 5)
+    start, step = (np.array(v, dtype=np.int64)[1:] for v in points.steps(rows))
+    assert np.array(points.ray_count(mi.UInt32(4 * rays), rows)).tolist() == [4 * rays, *[rays] * 4]
+    assert np.array(points.ray_count(mi.UInt32(3), rows)).tolist() == [3, 1, 1, 1, 1]
     numbers = start[:, None] + step[:, None] * np.arange(rays)
     for own in (*numbers, numbers.ravel()):
         at = own[:, None] * (factors % 2**32) % 2**32 / 2**32
@@ -173,6 +176,38 @@ def test_meshes_beside_an_object_have_the_mean_light_of_their_points() -> None:
     beside = is_mesh & binary_dilation(~is_mesh, np.ones((3, 3))) & (own.proxy_instance == 0) & valid.any(axis=0)
     assert beside.sum() > 50
     assert np.sqrt(np.mean((own.light[..., 0] - twin)[beside] ** 2)) < 0.1  # 0.15 with light at the centres
+
+
+def test_roughness_of_a_pixel_includes_the_spread_of_normals() -> None:
+    """Slow twin of alpha'^2 = alpha^2 + 2 mean(d^2) / 4 cos^2, over traced neighbours of one shape without an edge."""
+    make_integrator()
+    size, rng = 9, np.random.default_rng(4)
+    camera = down_camera(size=size)
+    view = CameraView(size, size, camera.fx, camera.fy, camera.cx, camera.cy, camera.world_from_camera)
+    index = np.flatnonzero(rng.random(size * size) < 0.9).astype(np.uint32)  # the others have no traced light
+    place = np.full(size * size, UNTRACED, dtype=np.uint32)
+    place[index] = np.arange(len(index))
+    normal = np.array([0, 0, 1]) + rng.normal(scale=0.12, size=(len(index), 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    trait, roughness = np.float32(index // size > 5), rng.uniform(0.1, 0.6, len(index))
+    to_camera = np.array([0.6, 0, 0.8])
+    expected = []
+    for row, pixel in enumerate(index):
+        y, x = divmod(int(pixel), size)
+        around = [(y, x - 1), (y, x + 1), (y - 1, x), (y + 1, x)]
+        rows = [place[j * size + i] for j, i in around if 0 <= i < size and 0 <= j < size]
+        like = [
+            r for r in rows if r != UNTRACED and trait[r] == trait[row] and normal[r] @ normal[row] > footprint.EVEN
+        ]
+        spread = np.mean([np.sum((normal[r] - normal[row]) ** 2) for r in like]) if like else 0
+        alpha = np.sqrt(roughness[row] ** 4 + 2 * spread / 4 * (normal[row] @ to_camera) ** 2)
+        expected.append(np.sqrt(alpha))
+    values: dict[str, Any] = dict.fromkeys(LitSurface.__dataclass_fields__, mi.Float(0))
+    values |= {"normal": mi.Vector3f(normal.T.astype(np.float32)), "to_camera": mi.Vector3f(to_camera)}
+    values |= {"trait": mi.Float(trait), "roughness": mi.Float(roughness.astype(np.float32))}
+    got = footprint.filtered_roughness(LitSurface(**values), mi.UInt32(index), mi.UInt32(place), view)
+    np.testing.assert_allclose(got, expected, rtol=1e-4)
+    assert np.mean(np.array(got) > roughness + 0.01) > 0.5
 
 
 def test_pixels_without_similar_neighbours_get_the_saved_rays() -> None:

@@ -18,9 +18,10 @@ from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_light import WHITE_SKY, nothing
 
 ensure_variant()
+from mitsplat.renderer.light import light as light_stages  # noqa: E402
 from mitsplat.renderer.light.light_estimate import Estimate  # noqa: E402
 from mitsplat.renderer.light.light_filter import LightFilter  # noqa: E402
-from mitsplat.renderer.light.light_planes import SAMPLES, Planes, between_samples  # noqa: E402
+from mitsplat.renderer.light.light_planes import SAMPLES, CoarseLight, Planes, between_samples  # noqa: E402
 from mitsplat.renderer.light.light_tiles import BLOCK  # noqa: E402
 from mitsplat.renderer.light.lit_surface import LitSurface  # noqa: E402
 from mitsplat.renderer.rays.camera_rays import CameraView  # noqa: E402
@@ -161,7 +162,24 @@ def test_shadows_on_planes_equal_those_of_all_pixels(monkeypatch: pytest.MonkeyP
         return result
 
     monkeypatch.setattr(Planes, "coarse", coarse)
+    kept: list[CoarseLight] = []
+    trace = light_stages.trace_planes
+
+    def trace_planes(*args: Any) -> CoarseLight:
+        result = trace(*args)
+        assert result is not None
+        kept.append(result)
+        return result
+
+    monkeypatch.setattr(light_stages, "trace_planes", trace_planes)
     runs = np.array([board(seed=s).light.mean(axis=-1) for s in range(4)])
+    # Every second pixel of coarse tiles is traced, in both directions.
+    y, x = np.indices(truth.shape)
+    for mask, coarse_light in zip(chosen, kept, strict=True):
+        traced = (mask & ((x | y) & 1 == 0)).ravel()
+        np.testing.assert_array_equal(coarse_light.lattice, traced)
+        np.testing.assert_array_equal(np.sort(coarse_light.pixel), np.flatnonzero(traced))
+    monkeypatch.setattr(light_stages, "trace_planes", trace)
     monkeypatch.setattr(Planes, "count", 0)
     whole = np.array([board(seed=s).light.mean(axis=-1) for s in range(4)])
     common = np.logical_and.reduce(chosen)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -21,7 +22,8 @@ from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.layers import make_integrator, make_splats_shape, render_layers
-from mitsplat.renderer.light.reflections import COLUMN_STEP, RAY_STEP, ROW_STEP, Reflections
+from mitsplat.renderer.light import reflections
+from mitsplat.renderer.light.reflections import COLUMN_STEP, RAY_STEP, ROW_STEP, Reflections, ReflectionTracer
 from mitsplat.renderer.light.shadow_rays import ROBERTS
 from mitsplat.renderer.materials.principled import typical_brightness
 from tests.renderer.test_bounce import mitsuba_camera
@@ -249,6 +251,34 @@ def test_mirror_shows_an_object_at_its_image() -> None:
     seen = (light.light[..., 0] < 0.75) & floor_seen
     assert expected.sum() > 100
     assert (seen & expected).sum() / (seen | expected).sum() > 0.85
+
+
+@pytest.mark.parametrize("lanes", [reflections.LANES, 3])
+def test_each_ray_of_a_pixel_takes_the_next_number_of_its_sequence(monkeypatch: pytest.MonkeyPatch, lanes: int) -> None:
+    """Sums over the numbers of the rays equal those of a loop, also if the rays are traced in parts."""
+    make_integrator()
+    monkeypatch.setattr(reflections, "LANES", lanes)
+    pixel, begin, step = np.array([3, 10, 40, 41]), np.array([0, 2, 0, 1]), np.array([1, 4, 4, 1])
+    places, done, rays = np.array([2, 0, 3]), np.array([0, 3, 1]), np.array([4, 1, 5])
+
+    def light(_: Any, places: mi.UInt32, number: mi.UInt32) -> tuple[mi.Color3f, mi.Color3f]:
+        return mi.Color3f(mi.Float(number % 1009)), mi.Color3f(mi.Float(places))
+
+    monkeypatch.setattr(ReflectionTracer, "_light", light)
+    steps = mi.UInt32(begin), mi.UInt32(step)
+    stub: Any = SimpleNamespace(pixel=mi.UInt32(pixel), view=SimpleNamespace(width=7), seed=5)
+    tracer = ReflectionTracer(stub, stub, steps)
+    got = tracer.trace(mi.UInt32(places), mi.Float(done), mi.UInt32(rays))
+    for row, (place, before, count) in enumerate(zip(places, done, rays, strict=True)):
+        y, x = divmod(int(pixel[place]), 7)
+        start = 5 * 2654435761 + x * COLUMN_STEP + y * ROW_STEP
+        numbers = [start + (begin[place] + (before + i) * step[place]) * RAY_STEP for i in range(count)]
+        values = np.array([number % 2**32 % 1009 for number in map(int, numbers)], dtype=np.float64)
+        brightness = np.array(typical_brightness(mi.Color3f(mi.Float(values)), mi.Color3f(mi.Float(place))))
+        assert np.array(got.tinted.x)[row] == pytest.approx(values.sum())
+        assert np.array(got.colourless.z)[row] == count * place
+        assert np.array(got.squares)[row] == pytest.approx((brightness**2).sum(), rel=1e-5)
+    assert np.array(got.rays).tolist() == rays.tolist()
 
 
 @pytest.mark.parametrize("valid", [16, 8, 4])

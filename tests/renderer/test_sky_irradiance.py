@@ -5,8 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 
-from mitsplat.renderer.emitters.emitter_sampling import sky_irradiance
+from mitsplat.renderer.emitters.emitter_sampling import Emitters, receiver, sky_irradiance
 from mitsplat.renderer.emitters.sky_irradiance import _folded, _unfolded
 from mitsplat.runtime.variant import ensure_variant
 
@@ -52,6 +53,24 @@ def test_the_irradiance_table_agrees_with_a_quadrature() -> None:
     error = np.abs(found - expected) / expected.max()
     assert error.max() < 0.01
     assert error.mean() < 0.0025
+
+
+def test_samples_of_an_environment_map_have_its_irradiance_as_mean() -> None:
+    """With and without the sun above the horizon. The densities of directions integrate to 1 over the hemisphere."""
+    ensure_variant()
+    scene = mi.load_dict({"type": "scene", "sky": sky_with_a_sun()})
+    normals = np.array([[0.0, 0, 1], [0, 0, -1], [0.6, 0, -0.8]])
+    emitters, count = Emitters(scene, (0, 0, 0)), 1 << 18
+    points = mi.Point2f(np.random.default_rng(0).random((2, count), dtype=np.float32))
+    for normal, expected in zip(normals, by_quadrature(scene.emitters()[0], normals), strict=True):
+        si = receiver(dr.zeros(mi.Point3f, count), mi.Vector3f(*normal.tolist()))
+        beam = emitters.sample(si, points, mi.Bool(True))
+        irradiance = np.array(beam.irradiance)
+        error = irradiance.std(axis=1) / np.sqrt(count)
+        np.testing.assert_array_less(np.abs(irradiance.mean(axis=1) - expected), 4 * error + 2e-3 * expected)
+        above = np.array(dr.dot(beam.direction, mi.Vector3f(*normal.tolist()))) > 0
+        inverse = np.where(above, 1 / np.maximum(np.array(beam.density), 1e-6), 0)
+        assert inverse.mean() == pytest.approx(2 * np.pi, rel=0.02)
 
 
 def test_the_octahedral_map_is_bijective() -> None:

@@ -442,6 +442,48 @@ def test_the_allowed_depth_grows_with_the_size_of_an_object(size, depth, refused
     assert (state.find_defect() is not None) == refused
 
 
+@pytest.mark.parametrize(
+    ("places", "arrangement", "tilts", "expected"),
+    [
+        ([(0, 0, 0.0)], "drop", [None], None),
+        ([(0, 0, 5e-4)], "drop", [None], None),
+        ([(0, 0, 0.0), (0.1, 0, 2e-3)], "drop", [None, None], ("part 1 rests 2.0 mm or more from what is near", {1})),
+        ([(0, 0, 0.3)], "drop", [None], ("part 0 rests 5.0 mm or more", {0})),
+        ([(0, 0, 0.0), (0.0497, 0, 0.0)], "drop", [None, None], None),
+        ([(0, 0, 0.0), (0.0492, 0.01, 0.0)], "drop", [None, None], ("part 0 and part 1 overlap by 0.8 mm", {0, 1})),
+        ([(0, 0, 0.0), (0.0503, 0, 0.0)], "drop", [None, None], None),
+        ([(0, 0, 0.0), (0.0503, 0, 0.0)], "scatter", [None, None], ("part 0 and part 1 touch", {0, 1})),
+        ([(0, 0, 0.0), (0.0508, 0, 0.0)], "scatter", [None, None], None),
+        ([(0, 0.1, 0.0), (0.1742, 0, 0.0)], "drop", [None, None], ("part 1 rests against the enclosure", {1})),
+        ([(0.1735, 0, 0.0)], "drop", [None], None),
+        ([(0, 0, 0.0), (0.1, 0, 0.0)], "upright", [4.9, 5.1], ("part 1 fell over", {1})),
+        ([(0, 0, 0.0), (0.1, 0, 0.0)], "drop", [4.9, 5.1], None),
+    ],
+)
+def test_each_defect_of_a_resting_state_is_found(places, arrangement, tilts, expected):
+    """Boxes of 50 mm stand on or above a table; a wall of the enclosure is at x = 0.2 m."""
+    from mitsplat.geometry.mesh_distance import DistanceSurface, PlacedSurface
+    from mitsplat.physics.certificate import RestingObject, RestingState
+
+    box = DistanceSurface(trimesh.creation.box((0.05,) * 3))
+    surfaces = [
+        PlacedSurface(f"part {i}", box, pose_at(np.add(place, (0, 0, 0.025)))) for i, place in enumerate(places)
+    ]
+    table = PlacedSurface("table", DistanceSurface(trimesh.creation.box((1.0, 1.0, 0.1))), pose_at((0, 0, -0.05)))
+    wall = PlacedSurface("enclosure 1", DistanceSurface(trimesh.creation.box((0.1, 1, 1))), pose_at((0.25, 0, 0.501)))
+    items = [RestingObject(surface, arrangement, tilt) for surface, tilt in zip(surfaces, tilts, strict=True)]
+    state = RestingState(items, [table, wall])
+    gaps = [min(place[2], 5e-3) for place in places]
+    if "overlap" not in (expected or [""])[0]:
+        np.testing.assert_allclose(state.support_gaps, gaps, atol=2e-6)
+        assert state.pair_penetration < 4e-4
+    defect = state.find_defect()
+    if expected is None:
+        assert defect is None
+    else:
+        assert defect is not None and defect.reason.startswith(expected[0]) and set(defect.causes) == expected[1]
+
+
 def test_a_scene_without_colliders_is_refused(scene_data, write_scene):
     scene_data["shapes"][0]["collider"] = False
     with pytest.raises(InputError, match="must be a collider, on which objects rest"):

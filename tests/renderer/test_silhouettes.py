@@ -181,6 +181,18 @@ def test_an_object_close_to_the_camera_has_its_complete_area(source: str, shift:
     assert found.area + found.beyond == pytest.approx((view.fx * side / distance) ** 2, rel=0.01)
 
 
+@pytest.mark.parametrize("end", [(4.0, 0.2), (-4.0, 0.2), (0.2, 4.0), (0.2, -4.0)])
+def test_an_object_beyond_one_side_of_the_canvas_has_its_whole_area(end: tuple[float, float]) -> None:
+    """A plate of 4 m x 0.2 m from the middle of the image, at 1 m from the camera."""
+    ensure_variant()
+    x, y = end
+    plate = trimesh.creation.box(bounds=np.sort([[0, 0, -0.01], [x, y, 0]], axis=0))
+    scene = mi.load_dict({"type": "scene", "plate": make_splats_shape(ball(1)[0], np.eye(4), plate, instance=1)})
+    view = ms.Camera.look_at((0, 0, 1), (0, 0, 0), up=(0, 1, 0), width=WIDTH, height=HEIGHT, fov_x=60)
+    found = render_silhouettes(make_integrator(shadow="none"), scene, view, source="proxies")[1]
+    assert found.area + found.beyond == pytest.approx(abs(x * y) * view.fx * view.fy, rel=0.02)
+
+
 def test_an_object_that_reaches_behind_the_camera_has_a_large_finite_area() -> None:
     ensure_variant()
     floor = trimesh.creation.box((4, 4, 0.01))

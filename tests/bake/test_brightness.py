@@ -12,6 +12,8 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
+from mitsplat.bake.radiance import _sharpen_colours
+from mitsplat.gaussians.surfels import place_surfels
 from mitsplat.geometry.camera import Camera
 from mitsplat.images.colour import decode_srgb
 from mitsplat.scene.spec.light_spec import EnvironmentLight
@@ -82,3 +84,19 @@ def test_folds_do_not_darken_the_colours_of_a_crumpled_body() -> None:
     result = bake_asset(star, name="star", settings=settings, pieces=[star.convex_hull])
     assert result.brightness == pytest.approx(1.0, abs=0.05)
     assert result.warnings == ()
+
+
+def test_blends_of_sharpened_colours_are_nearer_to_the_surface() -> None:
+    """Slow twin of the blend, over all Gaussians. No colour is beyond those of its 16 nearest Gaussians."""
+    surfels = place_surfels(trimesh.creation.box((0.04, 0.04, 0.04)), 1.0, 600, np.random.default_rng(0))
+    target = np.sin(200 * surfels.points)[:, None]  # a period of 31 mm
+    offset = surfels.points[:, None] - surfels.points
+    local = np.einsum("nkj,kji->nki", offset, surfels.frames)[..., :2] / surfels.scales[:, :2]
+    weight = np.exp(-0.5 * (local**2).sum(axis=2)) * (surfels.normals @ surfels.normals.T > 0.8)
+    weight /= weight.sum(axis=1, keepdims=True)
+    found = _sharpen_colours(surfels, target)
+    before, after = (np.sqrt(np.mean((np.einsum("nk,kbc->nbc", weight, c) - target) ** 2)) for c in (target, found))
+    assert after < 0.8 * before
+    nearest = np.argsort(np.linalg.norm(offset, axis=2), axis=1)[:, :16]
+    around = target[nearest]
+    assert (found >= around.min(axis=1)).all() and (found <= around.max(axis=1)).all()

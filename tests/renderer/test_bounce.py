@@ -71,6 +71,22 @@ def test_a_red_wall_reflects_half_of_its_colour(wall: Any) -> None:
     np.testing.assert_allclose(without, 0.5, atol=0.03)
 
 
+def test_a_shadow_far_from_its_object_keeps_the_light_of_the_wall() -> None:
+    """A plate that covers 0.2 % of the hemisphere blocks a parallel light of half of white irradiance.
+
+    The wall of colour c sends c / 2 of white irradiance to the floor: (0 + c / 2) / (1 / 2 + c / 2) remains.
+    """
+    make_integrator()
+    shapes = {
+        "wall": captured_wall(),
+        "floor": make_splats_shape(floor(0.5), proxy=slab(0.5)),
+        "plate": object_box((-0.02, -0.02, 0.5), (0.02, 0.02, 0.51), 1),
+        "sun": {"type": "directional", "direction": [0, 0, -1], "irradiance": 0.5 * np.pi},
+    }
+    light = noise_free(shapes, down_camera(0.2, 32, 6.0), white=np.pi, bounce=True).light
+    np.testing.assert_allclose(light.mean(axis=(0, 1)), RED / (1 + RED), atol=0.03)
+
+
 def test_surroundings_with_changed_colours_reflect_these() -> None:
     """The wall of :func:`test_a_red_wall_reflects_half_of_its_colour` with permuted colours at half the brightness."""
     make_integrator()

@@ -100,6 +100,22 @@ def test_surroundings_with_changed_colours_reflect_these() -> None:
     np.testing.assert_allclose((with_bounce - without).mean(axis=(0, 1)) / (0.5 * RED[[1, 2, 0]]), 0.5, atol=0.03)
 
 
+def test_captured_colours_contain_the_light_of_relit_surroundings() -> None:
+    """A black object beside a captured floor does not add the light of a static wall to the floor."""
+    make_integrator()
+    block = trimesh.creation.box(bounds=[[-0.03, -0.01, 0.0], [-0.02, 0.01, 0.01]])
+    shapes = {
+        "wall": relit_wall(),
+        "floor": make_splats_shape(floor(0.02), proxy=slab(0.02)),
+        "block": make_splats_shape(nothing(), proxy=block, instance=1),
+        "sky": WHITE_SKY,
+    }
+    layers = noise_free(shapes, down_camera(0.2, 32, 6.0), white=np.pi, bounce=True)
+    away = layers.light[:, 16:]
+    assert np.abs(away - 1).max() < 0.1
+    assert layers.light.max() < 1.02
+
+
 @pytest.mark.parametrize("wall", [relit_wall, wall_of_materials])
 def test_a_metal_plate_mirrors_relit_surroundings(wall: Any) -> None:
     """Relit walls are as bright as half of the sky in front of them, whatever their light was when captured."""

@@ -125,7 +125,7 @@ class CapturedHits:
         if self.emitters.sky is not None:
             ray.maxt = self.emitters.sky_reach
         near = dynamic.intersect(ray)
-        hits_object = near.is_valid()
+        hits_object = near.is_valid() & ~self.proxies.on_relit_surroundings(near)
         dr.eval(ray, near, hits_object, emitter_sample, captured, normal, key)
         row = dr.compress(hits_object)
         if not dr.width(row):

@@ -116,7 +116,7 @@ class Reflectors:
             sequence: Function that maps ray numbers to two points of the unit square.
 
         Returns:
-            Irradiance from all surfaces, irradiance from the captured surroundings as if there were no dynamic objects,
+            Irradiance from all surfaces, irradiance from the surroundings as if there were no dynamic objects,
             and inverse distance [1/m] of the surfaces, a mean that is weighted by their light.
         """
         count = dr.width(origin)
@@ -161,7 +161,7 @@ class Reflectors:
     def _trace(
         self, ray: mi.Ray3f, key: mi.UInt32, emitter_sample: mi.Point2f, spread: mi.Float, bounces: int
     ) -> tuple[mi.Color3f, mi.Color3f, mi.Float]:
-        """Return the colours (Color3f) at the hits of rays, the colours without dynamic objects, and the distances."""
+        """Return the colours (Color3f) at the hits of rays, those of surroundings alone, and the distances."""
         static, reflecting = self.proxies.captured, self.proxies.reflecting
         captured, distance = mi.Color3f(dr.zeros(mi.Float, dr.width(key))), mi.Float(dr.inf)
         ray.maxt = dr.inf
@@ -203,6 +203,10 @@ class Reflectors:
             light = dr.gather(mi.Color3f, colour, lane) + self._reflected(bounces, gathered(paths, lane))
             dr.eval(light)  # avoids a copy of the colours before the write
             dr.scatter(colour, light, lane)  # scatter_add compiles per size
+            if self.proxies.first_relit is not None:
+                own = self.proxies.on_relit_surroundings(dr.gather(mi.PreliminaryIntersection3f, near, lane))
+                dr.scatter(captured, light, lane, own)
+                dr.eval(captured)
         dr.eval(colour)
         return colour, captured, distance
 

@@ -168,6 +168,7 @@ class Proxies:
         static, dynamic: These scenes, for hits.
         captured: Static proxies that show captured light, which reflected rays meet.
         reflecting: Other proxies and the visible shapes, which reflect the light of the emitters.
+        first_relit: First triangle of relit surroundings in ``reflecting``; None if there are none.
         shadow_casters: Scenes that cast the shadows of dynamic objects: none, one or two.
         boxes: Boxes around the dynamic proxies, see :class:`Boxes`; None if there are none.
         shows_meshes: True if the dynamic proxies include visible meshes.
@@ -188,9 +189,13 @@ class Proxies:
         if any(o.dynamic and o.instance == 0 for o in occluders):
             self._surroundings = TraceScene.build([o for o in occluders if not o.dynamic or o.instance == 0])
         self.captured, self.reflecting = self.static, self.dynamic
-        if any(not o.dynamic and o.splats is not None for o in occluders):
+        self.first_relit: mi.UInt32 | None = None
+        relit = [o for o in occluders if not o.dynamic and not o.is_captured]
+        if relit:
             self.captured = TraceScene.build([o for o in occluders if o.is_captured])
-            self.reflecting = TraceScene.build([o for o in occluders if not o.is_captured], visible)
+            self.reflecting = TraceScene.build([*(o for o in occluders if o.dynamic), *relit], visible)
+            before = 0 if self.dynamic is None or self.dynamic.mesh is None else dr.width(self.dynamic.instances)
+            self.first_relit = dr.opaque(mi.UInt32, before)
         shadow_casters = (
             [self.dynamic] if casters is None else [TraceScene.build([], visible), SplatOccluders.build(casters)]
         )
@@ -205,6 +210,12 @@ class Proxies:
     def occluder_scenes(self) -> tuple[OccluderScene, ...]:
         """All occluder scenes, the static proxies first."""
         return self.shadow_casters if self.static is None else (self.static, *self.shadow_casters)
+
+    def on_relit_surroundings(self, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+        """Return True for hits in ``reflecting`` on surroundings, whose light captured colours contain."""
+        if self.first_relit is None or self.reflecting is None:
+            return mi.Bool(False)
+        return ~self.reflecting.is_visible(hit) & (hit.prim_index >= self.first_relit)
 
     def nearest(self, ray: mi.Ray3f) -> tuple[Hit, Hit]:
         """Return the first hits of rays, and the first hits without the dynamic objects and visible shapes."""

@@ -132,8 +132,11 @@ def _units(asset: Asset, size: float) -> Finding:
     low, high = SIZE_LIMITS[asset.kind]
     if asset.units == "unknown":
         return Finding("units", False, "unknown", "measure the longest extent and give it as size [m] in asset.yaml")
-    wrong = next((factor for factor in (1e-3, 1e3, 0.01, 100.0) if low <= size * factor <= high), None)
-    hint = "set units or size in asset.yaml" if wrong is None else f"is units: {wrong:g} missing in asset.yaml?"
+    factor = next((factor for factor in (1e-3, 1e3, 0.01, 100.0) if low <= size * factor <= high), None)
+    hint = "set units or size in asset.yaml"
+    if factor is not None:
+        error = f"{factor:g} times too small" if factor > 1 else f"{1 / factor:g} times too large"
+        hint = f"are units (1 by default) or size in asset.yaml {error}?"
     return Finding("units", low <= size <= high, f"the longest extent is {size:.4g} m", hint)
 
 

@@ -81,7 +81,11 @@ def changed(splats, rows, **values):
 GOOD = solid()
 OPEN = trimesh.Trimesh(GOOD.mesh.vertices, GOOD.mesh.faces[1:], process=False)
 FAULTS = {
-    "units": (GOOD.transformed(np.diag([1000, 1000, 1000, 1])), "is units: 0.001 missing"),
+    "units": (
+        GOOD.transformed(np.diag([1000, 1000, 1000, 1])),
+        "are units (1 by default) or size in asset.yaml 1000 times too large?",
+    ),
+    " units": (GOOD.transformed(np.diag([0.001, 0.001, 0.001, 1])), "or size in asset.yaml 1000 times too small?"),
     "units ": (replace(GOOD, units="unknown"), "give it as size"),
     "up axis": (replace(solid(size=(2, 0.3, 3)), kind="environment"), "set up: y"),
     "needles": (replace(GOOD, splats=changed(GOOD.splats, 60, scales=(0.02, 0.001, 0.001))), "mitsplat mesh"),

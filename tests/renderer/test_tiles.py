@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +16,29 @@ from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_render import make_splats
 
 CAMERA = Camera.look_at((0, 0, -2), (0, 0, 0), up=(0, -1, 0), width=75, height=50, fov_x=50)
+
+
+FISHEYE = {"distortion": (0.02, -0.01, 0.004, -0.001), "lens": "fisheye"}
+
+
+@pytest.mark.parametrize("lens", [{}, {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)}, FISHEYE])
+def test_the_box_of_a_tile_holds_the_rays_of_its_pixels(lens: dict[str, Any]) -> None:
+    """Without distortion, the box ends at the outermost rays, otherwise at most a pixel beyond them."""
+    ensure_variant()
+    from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH
+    from mitsplat.renderer.rays.sensors import view_of
+
+    view = view_of(make_sensor(replace(CAMERA, width=80, height=52, **lens)))
+    y, x = np.mgrid[:52, :80]
+    slopes = [np.array(v).reshape(52, 80) for v in view.slopes(mi.Float(x.ravel() + 0.5), mi.Float(y.ravel() + 0.5))]
+    across = 80 // TILE_WIDTH
+    box = [np.array(v).reshape(-1, across) for v in view.tile_slopes(dr.arange(mi.UInt32, view.tiles_x * view.tiles_y))]
+    reach = 1.5 / CAMERA.fx if lens else 0.0
+    for values, low, high in ((slopes[0], *box[:2]), (slopes[1], *box[2:])):
+        tiles = values.reshape(-1, TILE_HEIGHT, across, TILE_WIDTH)
+        for bound, outermost, sign in ((low, tiles.min(axis=(1, 3)), 1), (high, tiles.max(axis=(1, 3)), -1)):
+            beyond = sign * (outermost - bound)
+            assert beyond.min() > -1e-6 and beyond.max() <= reach + 1e-6
 
 
 @pytest.mark.parametrize("lens", [{}, {"distortion": (-0.25, 0.08, 0.002, -0.001, -0.01)}])

@@ -525,6 +525,20 @@ def test_objects_rest_on_the_drawn_environment(scene_data, write_scene):
     assert alone.to_json() == layout.to_json()
 
 
+def test_a_moved_collider_leaves_the_original_in_place():
+    from mitsplat.physics.bodies import Collider
+    from mitsplat.physics.friction import ContactMaterial
+
+    piece, motion = trimesh.creation.box((0.1, 0.1, 0.1)), pose_at((0.2, 0, 0))
+    original = Collider(ContactMaterial(), pieces=(piece,))
+    for moved in (original.moved(motion), original.moved(motion)):  # of two layouts
+        np.testing.assert_allclose(moved.pieces[0].centroid, (0.2, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(original.pieces[0].centroid, 0, atol=1e-12)
+    moved = Collider(ContactMaterial(), box=((1, 1, 1), pose_at((0, 0.1, 0)))).moved(motion)
+    assert moved.box is not None and not moved.pieces
+    np.testing.assert_allclose(moved.box[1], pose_at((0.2, 0.1, 0)))
+
+
 def test_objects_rest_on_the_jittered_shape(scene_data, write_scene):
     """In the scene file, a step of 4 cm is beside the place where objects fall; in some layout it is below."""
     step = {"size": [0.3, 0.3, 0.04], "position": [0.25, 0, 0.02]}

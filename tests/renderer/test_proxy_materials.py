@@ -18,7 +18,7 @@ from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.composition.scene_contents import ContentsReader
 from mitsplat.renderer.layers import make_integrator, make_splats_shape
 from mitsplat.renderer.materials.proxy_materials import corner_materials, material_triangles
-from mitsplat.renderer.occluders.proxies import Occluder, Proxies, TraceScene
+from mitsplat.renderer.occluders.proxies import Occluder, Proxies, TraceScene, _own_corners
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
 
 BOX = trimesh.creation.box(extents=(1, 1, 1))
@@ -116,6 +116,18 @@ def test_sides_of_a_thin_sheet_keep_their_materials() -> None:
         side = normal * sheet.face_normals[triangles.face, 2] > 0.5
         inner = np.abs(triangles.interpolate(sheet.triangles)[side][..., :2]).max(axis=(1, 2)) < 0.08
         np.testing.assert_allclose(corners[side][inner][..., 3], metallic, atol=0.01)
+
+
+def test_triangles_divided_between_materials_keep_smooth_unit_normals() -> None:
+    ball = trimesh.creation.icosphere(2, 0.1)
+    surfels = place_surfels(ball, 1.0, 3000, np.random.default_rng(0))
+    upper = np.float32(surfels.points[:, 2] > 0)
+    splats = replace(surfels.splats(np.zeros((len(upper), 1, 3))), materials=SplatMaterials(upper, upper, upper))
+    corners, normals = _own_corners(ball, splats)
+    assert len(corners) > 3 * len(ball.faces)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    outward = corners / np.linalg.norm(corners, axis=1, keepdims=True)
+    assert (normals * outward).sum(axis=1).min() > np.cos(np.radians(5))
 
 
 def test_surfaces_without_splats_reflect_nothing() -> None:

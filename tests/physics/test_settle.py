@@ -490,10 +490,13 @@ def test_a_scene_without_colliders_is_refused(scene_data, write_scene):
         settle_layout(load_scene(write_scene(scene_data)), 0, cached=False)
 
 
-def test_an_environment_carries_objects(scene_data, write_scene):
+@pytest.mark.parametrize("divided", [True, False])
+def test_an_environment_carries_objects(scene_data, write_scene, divided):
+    """Its convex pieces are computed if the asset has none."""
     scene = load_scene(write_scene(scene_data))
     step = trimesh.creation.box((0.6, 0.6, 0.04)).apply_translation((0, 0, -0.005))
-    environment = replace(scene.assets[0], name="cell", mesh=step, pieces=(step,), kind="environment")
+    pieces = (step,) if divided else ()
+    environment = replace(scene.assets[0], name="cell", mesh=step, pieces=pieces, kind="environment")
     region = scene.spec.region.model_copy(update={"min": (-0.2, -0.2, 0.03)})
     spec = scene.spec.model_copy(update={"region": region, "environment_collides": True})
     raised = replace(scene, environments=(environment,), spec=spec)

@@ -33,6 +33,15 @@ def test_a_still_camera_gives_no_blur() -> None:
     np.testing.assert_array_equal(develop(linear, {}, exposure_flow=(still[0], still[1])), develop(linear, {}))
 
 
+def test_a_picture_is_blurred_before_it_is_encoded() -> None:
+    linear = np.random.default_rng(2).random((*SHAPE, 3)).astype(np.float32)
+    swept = np.full(SHAPE, 3.0, np.float32), np.full(SHAPE, -1.5, np.float32)
+    blurred = host_array(blur_along_flow(device_array(linear), SHAPE, swept), SHAPE)
+    got = develop(linear, {}, exposure_flow=swept)
+    np.testing.assert_array_equal(got, develop(blurred, {}))
+    assert np.abs(got.astype(float) - develop(linear, {})).mean() > 20
+
+
 @pytest.mark.parametrize("corner", [1.5, -2.0])
 def test_chromatic_aberration_magnifies_red_and_reduces_blue(corner: float) -> None:
     """On a linear ramp, where interpolation is exact, red at a point equals green nearer to the centre by the shift."""

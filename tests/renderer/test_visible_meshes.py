@@ -283,3 +283,17 @@ def test_mitsubas_thin_lens_equals_the_camera_plugin() -> None:
     sharp = integrator.render(scene, make_sensor(camera))
     np.testing.assert_allclose(np.array(theirs), np.array(ours)[7:19, 5:25], atol=1e-4)
     assert np.abs(np.array(ours) - np.array(sharp))[..., :3].max() > 0.05
+
+
+def test_splats_in_front_hide_their_share_of_the_radiance_of_a_mesh() -> None:
+    ensure_variant()
+    from mitsplat.renderer.instances.primary_visibility import PrimaryVisibility
+
+    none, mesh = mi.Color3f(mi.Float([0, 0])), mi.Bool([True, True])
+    visible = PrimaryVisibility(
+        **{"colour": none, "alpha": mi.Float([1, 1]), "splat_alpha": mi.Float([0, 0.75]), "cover": mi.Float([0, 0.75])},
+        **{"solid": mesh, "diffuse": ~mesh, "front": mesh, "emission": none},
+        **{"mesh": mi.UInt32([1, 1]), "key": mi.UInt32([1, 1])},
+    )
+    for colour in visible.lit(none, none, mi.Color3f(mi.Float([2, 2]))):
+        np.testing.assert_allclose(np.array(colour), [[2, 0.5]] * 3)

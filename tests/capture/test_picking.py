@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mitsplat.capture.capture import Capture
+from mitsplat.capture.pipeline.capture_settings import CaptureSettings
 from mitsplat.capture.pipeline.picking import chosen_object, pick_along
 from mitsplat.errors import InputError
 from tests.capture.isolation.balls import THINGS, capture_of_balls, ground
@@ -31,6 +32,9 @@ def test_a_pixel_is_read_as_it_is_written(capture: Capture, pixel: str) -> None:
     with pytest.raises(InputError) as error:
         capture.picked(f"{name}:{pixel}")
     assert str(error.value) == f"{name}:{pixel}: a pixel must be given as X,Y (got {pixel})"
+    for picks in ({"picks": (f"{name}:{pixel}",)}, {"picks_not": (f"{name}:{pixel}",)}):
+        with pytest.raises(InputError, match="a pixel must be given as X,Y"):
+            CaptureSettings(**picks)  # before cameras are computed
 
 
 @pytest.mark.parametrize("thing", [0, 1, 2])

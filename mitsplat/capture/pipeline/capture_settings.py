@@ -9,6 +9,7 @@ from typing import Literal
 from mitsplat.arguments import check_fields
 from mitsplat.capture.alignment.metric_frame import DEFAULT_BOARD, check_distance
 from mitsplat.capture.boards.targets import LEAST_SQUARE, Board
+from mitsplat.capture.capture import parse_pixel
 from mitsplat.errors import InputError
 
 
@@ -88,3 +89,5 @@ class CaptureSettings:
                 raise InputError(rule)
         if self.scale_from is not None:
             check_distance(self.scale_from)
+        for pick in (*self.picks, *self.picks_not):
+            parse_pixel(pick.rpartition(":")[2], pick)

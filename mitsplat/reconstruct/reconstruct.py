@@ -12,7 +12,7 @@ import trimesh
 from mitsplat.arguments import check_fields, check_text
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
-from mitsplat.capture.capture import Capture
+from mitsplat.capture.capture import Capture, parse_pixel
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
@@ -93,7 +93,7 @@ class AssetJob:
 
     Raises:
         InputError: In one of these cases: refinement of a mesh that is not reconstructed from masks; ``remove`` with
-            an object or an imported mesh; ``light`` with an environment, a material or a size.
+            an object, an imported mesh or a text without pixel; ``light`` with an environment, a material or a size.
     """
 
     name: str
@@ -116,6 +116,8 @@ class AssetJob:
             )
         if self.remove and self.imported is not None:
             raise InputError("objects cannot be removed from an imported mesh: omit one of the two")
+        for place in self.remove:
+            parse_pixel(place.rpartition(":")[2], place)
         if self.light is not None:
             if self.kind != "object":
                 raise InputError(f"materials are estimated for objects only: omit the lights (got kind {self.kind})")

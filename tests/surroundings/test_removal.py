@@ -195,6 +195,8 @@ def test_picks_without_an_object_on_a_surface_are_refused(captured: Capture, poi
     mesh = ImportedMesh(trimesh.creation.box((1, 1, 1)))
     with pytest.raises(InputError, match="cannot be removed from an imported mesh"):
         AssetJob(name="cell", kind="environment", imported=mesh, remove=("photo05.png:3,4",))
+    with pytest.raises(InputError, match=r"photo05\.png:1_0,4: a pixel must be given as X,Y"):
+        AssetJob(name="cell", kind="environment", remove=("photo05.png:1_0,4",))
 
 
 def test_an_environment_records_removed_objects(

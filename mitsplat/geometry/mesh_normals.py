@@ -5,9 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+import scipy.sparse
 import trimesh
 
-from mitsplat.arrays import Float64Array
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array, IntegerArray
 
 CREASE_ANGLE = np.radians(28.0)
 """Dihedral angle above which an edge is a crease [rad]. Gaussians must not cross creases; normals are not smoothed
@@ -20,6 +21,9 @@ above which the facets are plane faces: ten times the default tolerance of the f
 
 _PLANE = 1e-3
 """Maximum angle between the faces of a plane facet [rad]."""
+
+_PARALLEL = 0.9
+"""Minimum cosine between two edges of a facet that are opposite edges of a curved surface."""
 
 NOISE_CREASE = 10.0
 """Dihedral angle of a crease over the lower quartile of a mesh's dihedral angles. The quartile is zero for CAD meshes,
@@ -37,7 +41,8 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE)
     does not depend on the diagonals that divide a facet into triangles.
 
     Two large faces at a small angle, such as a roof and a wide chamfer, are plane: a curved surface with facets that
-    wide would be too coarse. Facets of width w at an angle a are w a / 8 away from the arc through their edges.
+    wide would be too coarse. Facets of width w at an angle a are w a / 8 away from the arc through their edges. Facets
+    of a coarse cylinder are known by the bends at their opposite edges.
 
     Args:
         mesh: The mesh.
@@ -45,17 +50,18 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE)
             surfaces, large faces are smooth too.
     """
     corner = np.repeat(np.arange(len(mesh.faces)), 3)
+    facet = _facets(mesh)
     incidence = mesh.faces_sparse.astype(np.float64)
     pairs = (incidence.T @ incidence).tocoo()
     cosine = np.einsum("pd,pd->p", mesh.face_normals[pairs.row], mesh.face_normals[pairs.col])
     alike = cosine > np.cos(crease_angle)
     if crease_angle <= CREASE_ANGLE and len(mesh.faces):
-        width, angle = _widths(mesh), np.arccos(cosine.clip(-1, 1))
-        sagitta = np.minimum(width[pairs.row], width[pairs.col]) * angle / 8
-        alike &= sagitta <= _MAX_SAGITTA * mesh.extents.max()
+        faces = np.column_stack([pairs.row, pairs.col])
+        coarse = np.flatnonzero(alike & _is_coarse(mesh, faces, np.arccos(cosine.clip(-1, 1))))
+        alike[coarse] = _bend_on(mesh, facet, facet[faces[coarse]], crease_angle)
     row, col = pairs.row[alike], pairs.col[alike]
     normals = np.zeros((len(mesh.faces), 3, 3))
-    weights = _facet_weights(mesh)
+    weights = _facet_weights(mesh, facet)
     for k in range(3):
         shared = mesh.faces[col] == mesh.faces[row, k][:, None]
         share = np.einsum("pk,pk->p", shared, weights[col])
@@ -79,19 +85,41 @@ def smooth_normals(mesh: trimesh.Trimesh) -> Float64Array:
     return corner_normals(mesh, crease_angle=float(np.clip(NOISE_CREASE * usual, CREASE_ANGLE, SHARPEST)))
 
 
-def _facet_weights(mesh: trimesh.Trimesh) -> Float64Array:
-    """Return weights (F, 3) of faces at their corners, whose sums over the faces of a plane facet are its area."""
+def _facets(mesh: trimesh.Trimesh) -> Int64Array:
+    """Return the number of the plane facet of each face, (F,)."""
     plane = mesh.face_adjacency[mesh.face_adjacency_angles < _PLANE]
-    facet = trimesh.graph.connected_component_labels(plane, node_count=len(mesh.faces))
+    return np.asarray(trimesh.graph.connected_component_labels(plane, node_count=len(mesh.faces)), dtype=np.int64)
+
+
+def _facet_weights(mesh: trimesh.Trimesh, facet: Int64Array) -> Float64Array:
+    """Return weights (F, 3) of faces at their corners, whose sums over the faces of a plane facet are its area."""
     area = np.bincount(facet, mesh.area_faces)
     _, corner, count = np.unique(mesh.faces * len(area) + facet[:, None], return_inverse=True, return_counts=True)
     return np.asarray(area[facet][:, None] / count[corner].reshape(-1, 3))
 
 
-def _widths(mesh: trimesh.Trimesh) -> Float64Array:
-    """Return the smallest heights (F,) of faces."""
+def _is_coarse(mesh: trimesh.Trimesh, faces: IntegerArray, angle: Float64Array) -> BoolArray:
+    """Return True for pairs of ``faces`` (P, 2) at an ``angle`` [rad] that are large for facets of a curved surface."""
     edges = mesh.triangles - np.roll(mesh.triangles, 1, axis=1)
-    return np.asarray(2 * mesh.area_faces / np.maximum(np.linalg.norm(edges, axis=2).max(axis=1), 1e-300))
+    width = 2 * mesh.area_faces / np.maximum(np.linalg.norm(edges, axis=2).max(axis=1), 1e-300)
+    return np.asarray(width[faces].min(axis=1) * angle / 8 > _MAX_SAGITTA * mesh.extents.max())
+
+
+def _bend_on(mesh: trimesh.Trimesh, facet: Int64Array, pairs: Int64Array, crease_angle: float) -> BoolArray:
+    """Return True for ``pairs`` (P, 2) of coarse facets that both bend to a third one at an edge parallel to theirs."""
+    angles, sides = mesh.face_adjacency_angles, mesh.face_adjacency
+    bend = (angles < crease_angle) & _is_coarse(mesh, sides, angles)
+    sides, ends = facet[sides[bend]], mesh.vertices[mesh.face_adjacency_edges[bend]]
+    along = np.tile(trimesh.unitize(ends[:, 1] - ends[:, 0]), (2, 1))
+    own, other = sides.T.ravel(), sides[:, ::-1].T.ravel()
+    count, size = len(own), int(facet.max()) + 1
+    at = scipy.sparse.csr_array((np.ones(count), (np.arange(count), own)), (count, size))
+    near = (at @ at.T).tocoo()
+    parallel = np.abs(np.einsum("pd,pd->p", along[near.row], along[near.col])) > _PARALLEL
+    continued = np.zeros(count, dtype=bool)
+    continued[near.row[parallel & (other[near.row] != other[near.col])]] = True
+    both = continued & np.roll(continued, count // 2)
+    return np.isin(pairs @ (size, 1), np.column_stack([own, other])[both] @ (size, 1))
 
 
 def _flat_normals(mesh: trimesh.Trimesh) -> Float64Array:

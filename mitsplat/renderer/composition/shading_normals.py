@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float32Array, Float64Array
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.quality import Quality
 from mitsplat.renderer.composition.parameter_pass import ParameterPass, parameter_cloud
+from mitsplat.renderer.materials.proxy_materials import shortest_axes
 from mitsplat.renderer.occluders.proxies import Hit
 from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, merge_clouds
 from mitsplat.renderer.rays.camera_rays import TILE_HEIGHT, TILE_WIDTH, CameraView
@@ -121,9 +121,7 @@ def _decoded(image: Image) -> mi.Vector3f:
 
 def _disc_normals(splats: Splats, normals: Float32Array) -> Float32Array:
     """Return the shortest axes (N, 3) of splats on the side of their shading normals."""
-    axes = Rotation.from_quat(splats.quats).as_matrix()
-    shortest = splats.scales.argmin(axis=1)[:, None, None]
-    across = np.take_along_axis(axes, shortest, axis=2)[..., 0]
+    _, across = shortest_axes(splats)
     side = np.where(np.einsum("nd,nd->n", across, normals) < 0, -1.0, 1.0)
     return (side[:, None] * across).astype(np.float32)
 

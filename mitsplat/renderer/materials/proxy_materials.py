@@ -224,18 +224,21 @@ def corner_materials(mesh: trimesh.Trimesh, splats: Splats | None) -> Float32Arr
     least = NEIGHBOURS[0] if triangles is None else NEIGHBOURS_OF_MIXED
     neighbours = min(int(np.clip(len(opaque) // count, least, NEIGHBOURS[1])), len(opaque))
     _, nearest = KDTree(splats.means[opaque]).query(places.reshape(-1, 3), range(1, neighbours + 1))
-    axes = Rotation.from_quat(splats.quats[opaque]).as_matrix()
-    shortest = splats.scales[opaque].argmin(axis=1)
-    normals = np.take_along_axis(axes, shortest[:, None, None], axis=2)[..., 0]
+    shortest, normals = shortest_axes(splats.select(opaque))
     agreement = np.einsum("nki,ni->nk", normals[nearest], np.repeat(facing, 3, axis=0))
-    if (
-        shortest == 2
-    ).all():  # surfels, whose third axis points outward: those of the other side of a sheet do not count
+    if (shortest == 2).all():
+        # The third axis of surfels points outward: those of the other side of a sheet do not count.
         agreement = np.maximum(agreement, 0)
     weights = agreement**FACING + 1e-9
     if triangles is not None:
         weights *= _on_triangle(corners, splats, opaque[nearest])
     return np.einsum("nk,nkc->nc", weights / weights.sum(axis=1, keepdims=True), rows[nearest]).astype(np.float32)
+
+
+def shortest_axes(splats: Splats) -> tuple[Int64Array, Float64Array]:
+    """Return the index (N,) of the shortest axis of each Gaussian, and its direction (N, 3), which has no side."""
+    axes, shortest = Rotation.from_quat(splats.quats).as_matrix(), splats.scales.argmin(axis=1)
+    return shortest, np.take_along_axis(axes, shortest[:, None, None], axis=2)[..., 0]
 
 
 def _on_triangle(corners: Float64Array, splats: Splats, nearest: Int64Array) -> Float64Array:

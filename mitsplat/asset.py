@@ -33,8 +33,9 @@ from mitsplat.arrays import Float32Array, Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.mesh_normals import state_normals, stated_normals
 from mitsplat.geometry.rigid import homogeneous_matrix, scaling, transform_points
-from mitsplat.mesh_files.mesh_reading import read_mesh
+from mitsplat.mesh_files.mesh_reading import read_mesh, read_proxy
 from mitsplat.storage.field_types import Name, Positive
 from mitsplat.storage.file_kinds import no_folder_with
 from mitsplat.storage.files import resolve_inside, storage_errors
@@ -199,7 +200,7 @@ class Asset:
         elif spec.mesh == "hull":
             mesh = _hull(opaque_core(splats), key_place(folder / ASSET_FILE, ("mesh",)))
         else:
-            mesh = read_mesh(_named_file(folder, "mesh", spec.mesh))
+            mesh = read_proxy(_named_file(folder, "mesh", spec.mesh))
         asset = cls(
             **{key: getattr(spec, key) for key in COMMON_KEYS},
             class_name=spec.class_name or spec.name,
@@ -217,7 +218,7 @@ class Asset:
     def save(self, folder: str | PathLike[str], *, splats: str = "splats.ply") -> None:
         """Write the asset as a folder: ``asset.yaml``, splats, ``materials.ply``, ``mesh.ply`` and ``pieces.ply``.
 
-        Meshes are written as shapes only, in float32.
+        Meshes are written as shapes only, in float32, and the proxy with the normals that its source states.
 
         Args:
             folder: Target folder. It is created if it is missing; files of these names in it are replaced.
@@ -257,7 +258,10 @@ class Asset:
                 if stored.splats.materials is not None:
                     write_materials(stored.splats.materials, new / "materials.ply")
                 if stored.mesh is not None:
-                    _concatenated([stored.mesh]).export(new / "mesh.ply")
+                    shape = _concatenated([stored.mesh])
+                    if (normals := stated_normals(stored.mesh)) is not None:
+                        state_normals(shape, normals)
+                    shape.export(new / "mesh.ply")
                 if stored.pieces:
                     _concatenated(stored.pieces).export(new / "pieces.ply")
                 described = new / ASSET_FILE

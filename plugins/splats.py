@@ -15,7 +15,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_materials import specular_of
 from mitsplat.geometry.rigid import scaling, split_similarity
-from mitsplat.mesh_files.mesh_reading import read_mesh
+from mitsplat.mesh_files.mesh_reading import read_proxy
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.renderer.materials.proxy_materials import GlossChange
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance
@@ -285,7 +285,7 @@ def _load_uniform_splats(path: Path, modified: int, metallic: float, roughness: 
 
 @lru_cache(maxsize=64)
 def _load_mesh(path: Path, _modified: int) -> trimesh.Trimesh:
-    return read_mesh(path, merge=False)
+    return read_proxy(path, merge=False)
 
 
 mi.register_shape("splats", lambda props: SplatsShape(props))

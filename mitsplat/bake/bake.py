@@ -21,6 +21,7 @@ import trimesh
 from mitsplat.arguments import check_fields, check_least, check_list, check_number, check_text, check_type
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.asset import Asset
+from mitsplat.bake.file_normals import with_normals
 from mitsplat.bake.mesh_parts import MeshModel, MeshPart, read_model
 from mitsplat.bake.mesh_surface import MeshSurface
 from mitsplat.bake.part_shapes import UNIFORM_LIGHT, bake_lights, mitsuba_scene
@@ -193,7 +194,7 @@ def bake_asset(
         splats = _fit_splats(splats, pictures, fit_cameras, settings, stages)
     splats = replace(splats, materials=materials)
     stages("finding convex pieces")
-    proxy = make_proxy(model.parts, settings.proxy_faces)
+    proxy = with_normals(make_proxy(model.parts, settings.proxy_faces), [part.mesh for part in model.parts])
     asset = Asset(
         name=name,
         class_name=class_name or name,

@@ -11,6 +11,7 @@ import numpy as np
 import trimesh
 
 from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.bake.file_normals import NormalCount, normal_warnings, place_normals
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_materials import MAX_SPECULAR
@@ -51,7 +52,7 @@ class MeshPart:
 
     Attributes:
         name: Name of the part, for use in settings.
-        mesh: Geometry [m], with vertices merged by position.
+        mesh: Geometry [m], with vertices merged by position, and with the normals that its file states.
         colours: Linear base colour of every face corner, shape (F, 3, 3), or None if there is a ``texture``.
         texture: Display-encoded base colour, three channels, or None.
         metallic: Metalness, 0 for dielectrics to 1 for metals; the mean if there is a texture of it.
@@ -201,7 +202,7 @@ def read_model(
     ]
     units: float = metres_per_unit or file.metres_per_unit or 1.0
     axis: Axis = up or file.up or "z"
-    to_world, parts = world_from_file(units, axis), []
+    to_world, placed = world_from_file(units, axis), []
     for part in file.parts:
         if not np.isfinite(part.vertices).all():
             row = int(np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))[0])
@@ -209,21 +210,21 @@ def read_model(
             raise InputError(f"{source}: vertex positions must be finite (got {place} at vertex {row})")
         if len(part.vertices) and (most := float(np.abs(part.vertices).max())) > _MAX_POSITION:
             raise InputError(f"{source}: vertex positions must be at most {_MAX_POSITION:g} units (got {most:g})")
-        parts.append(_place(part, to_world @ part.transform, finish))
-    parts = [part for part in parts if part.mesh.area > 0]  # a scale of 0 hides a part
+        placed.append(_place(part, to_world @ part.transform, finish))
+    parts = [part for part, _ in placed if part.mesh.area > 0]  # a scale of 0 hides a part
     if not file.parts:
         raise InputError(f"{source}: a mesh needs at least one face (got none; is the file complete?)")
     if not parts:
         raise InputError(f"{source}: a mesh needs faces that have an area (got none)")
-    warnings = [*file.warnings]
+    warnings = [*file.warnings, *normal_warnings([count for _, count in placed])]
     warnings += _recentre(parts, file, source)
     warnings += _inverted_bodies(parts)
     warnings += _coincident_parts(parts)
     return MeshModel(tuple(parts), units, axis, tuple(stated), tuple(warnings))
 
 
-def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> MeshPart:
-    """Transform a part of a file, and apply a finish."""
+def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> tuple[MeshPart, NormalCount]:
+    """Transform a part of a file, apply a finish, and count its normals."""
     corners = np.arange(3)
     if np.linalg.det(transform[:3, :3]) < 0:  # a mirrored part: the order of its corners keeps its faces outward
         corners = corners[::-1]
@@ -234,6 +235,9 @@ def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> 
     vertices = trimesh.transform_points(geometry.vertices, transform)
     mesh = trimesh.Trimesh(vertices, geometry.faces[keep][:, corners], process=False)
     mesh.remove_unreferenced_vertices()
+    count = NormalCount()
+    if source.normals is not None:
+        count = place_normals(mesh, source.normals[keep][:, corners], transform[:3, :3])
 
     def select(texture: Texture | None) -> Texture | None:
         return None if texture is None else replace(texture, uv=texture.uv[keep][:, corners])
@@ -250,7 +254,7 @@ def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> 
         )
     elif painted is not None and (painted < OPAQUE).any():
         warnings.append(f"part {name!r} has a texture and vertex colours: the vertex colours are ignored")
-    return MeshPart(
+    part = MeshPart(
         name=name,
         mesh=mesh,
         colours=colours,
@@ -265,6 +269,7 @@ def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> 
         normal_map=select(material.normal_map),
         double_sided=source.double_sided and not (mesh.is_watertight and mesh.volume > 0),
     )
+    return part, count
 
 
 def _recentre(parts: Sequence[MeshPart], file: MeshFile, source: str) -> Iterator[str]:

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from mitsplat.arrays import Float32Array, Float64Array
+from mitsplat.arrays import Float32Array, Float64Array, Int64Array
 from mitsplat.geometry.mesh import contact_points, join_meshes
 from mitsplat.geometry.rigid import transform_points
 from mitsplat.runtime.warp_start import quiet_warp
@@ -70,6 +70,25 @@ class DistanceSurface:
         )
         found = positions.numpy().astype(np.float64)
         return found, normals.numpy().astype(np.float64), np.linalg.norm(found - points, axis=1)
+
+
+@quiet_warp()
+def nearest_faces(mesh: trimesh.Trimesh, points: Float64Array) -> tuple[Int64Array, Float64Array]:
+    """Return the nearest faces (N,) of a mesh to ``points`` (N, 3), and barycentric coordinates (N, 3) on them."""
+    surface = wp.Mesh(
+        points=wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device="cpu"),
+        indices=wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device="cpu"),
+    )
+    faces = wp.zeros(len(points), dtype=wp.int32, device="cpu")
+    weights = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
+    wp.launch(
+        _nearest_faces,
+        dim=len(points),
+        inputs=[surface.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), _FAR],
+        outputs=[faces, weights],
+        device="cpu",
+    )
+    return faces.numpy().astype(np.int64), weights.numpy().astype(np.float64)
 
 
 class PlacedSurface:
@@ -185,3 +204,14 @@ def _nearest_points(
     if query.result:
         positions[i] = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
         normals[i] = wp.mesh_eval_face_normal(mesh, query.face)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _nearest_faces(
+    mesh: wp.uint64, points: wp.array[wp.vec3], reach: float, faces: wp.array[int], weights: wp.array[wp.vec3]
+) -> None:
+    i = wp.tid()
+    query = wp.mesh_query_point_no_sign(mesh, points[i], reach)
+    if query.result:
+        faces[i] = query.face
+        weights[i] = wp.vec3(query.u, query.v, 1.0 - query.u - query.v)

@@ -25,6 +25,11 @@ _PLANE = 1e-3
 _PARALLEL = 0.9
 """Minimum cosine between two edges of a facet that are opposite edges of a curved surface."""
 
+_STATED = "corner_normals"
+"""Face attribute with stated normals, shape (F, 9). Those of a corner are in the frame of its face: the first edge, the
+in-plane axis and the face normal. Similarities of the mesh therefore do not change them.
+"""
+
 NOISE_CREASE = 10.0
 """Dihedral angle of a crease over the lower quartile of a mesh's dihedral angles. The quartile is zero for CAD meshes,
 whose flat faces have interior edges, and 2 to 8 degrees for reconstructed smooth surfaces.
@@ -44,11 +49,15 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease_angle: float = CREASE_ANGLE)
     wide would be too coarse. Facets of width w at an angle a are w a / 8 away from the arc through their edges. Facets
     of a coarse cylinder are known by the bends at their opposite edges.
 
+    A mesh with stated normals (:func:`state_normals`) has those.
+
     Args:
         mesh: The mesh.
         crease_angle: Dihedral angle above which an edge is a crease [rad]. Above the default, which is for rough
             surfaces, large faces are smooth too.
     """
+    if (stated := stated_normals(mesh)) is not None:
+        return stated
     corner = np.repeat(np.arange(len(mesh.faces)), 3)
     facet = _facets(mesh)
     incidence = mesh.faces_sparse.astype(np.float64)
@@ -83,6 +92,58 @@ def smooth_normals(mesh: trimesh.Trimesh) -> Float64Array:
     lengths = np.cumsum(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)[order])
     usual = angles[order[np.searchsorted(lengths, 0.25 * lengths[-1])]] if len(order) else 0.0
     return corner_normals(mesh, crease_angle=float(np.clip(NOISE_CREASE * usual, CREASE_ANGLE, SHARPEST)))
+
+
+def state_normals(mesh: trimesh.Trimesh, normals: Float64Array) -> None:
+    """Give a mesh, whose normals have not been used yet, unit ``normals`` (F, 3, 3) at the corners of its faces."""
+    local = np.einsum("fad,fkd->fka", _face_frames(mesh), normals)
+    mesh.face_attributes[_STATED] = local.reshape(-1, 9).astype(np.float32)
+
+
+def stated_normals(mesh: trimesh.Trimesh) -> Float64Array | None:
+    """Return the unit normals (F, 3, 3) that a mesh states at the corners of its faces, or None."""
+    local = mesh.face_attributes.get(_STATED)
+    if local is None:
+        return None
+    normals = np.einsum("fad,fka->fkd", _face_frames(mesh), np.asarray(local, dtype=np.float64).reshape(-1, 3, 3))
+    return np.asarray(normals / np.linalg.norm(normals, axis=2, keepdims=True))
+
+
+def read_stated_normals(mesh: trimesh.Trimesh) -> None:
+    """Give a mesh the stated normals of the PLY file from which trimesh read it, if it has any.
+
+    Raises:
+        ValueError: If they are not finite vectors of length 1 for all corners.
+    """
+    face = mesh.metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    if _STATED not in (getattr(getattr(face, "dtype", None), "names", None) or ()):
+        return
+    local = np.asarray(face[_STATED]["f1"], dtype=np.float32)
+    if local.shape != (len(mesh.faces), 9) or not np.allclose((local.reshape(-1, 3) ** 2).sum(axis=1), 1, atol=1e-2):
+        raise ValueError(f"{_STATED} must be three vectors of length 1 for each face")
+    mesh.face_attributes[_STATED] = local
+
+
+def normal_matrix(matrix: Float64Array) -> Float64Array:
+    """Return the matrices (..., 3, 3) that transform normals where ``matrix`` transforms points, up to a scale > 0.
+
+    They are the cofactors with the sign of the determinant: the inverse transpose, which singular matrices lack.
+    """
+    a, b, c = np.moveaxis(matrix, -2, 0)
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
+    mirrored = np.linalg.det(matrix)[..., None, None] < 0
+    return np.asarray(np.where(mirrored, -cofactors, cofactors))
+
+
+def _face_frames(mesh: trimesh.Trimesh) -> Float64Array:
+    """Return the rows first edge, in-plane axis and normal of faces, shape (F, 3, 3)."""
+    normal, edge = _flat_normals(mesh), mesh.triangles[:, 1] - mesh.triangles[:, 0]
+    least = np.eye(3)[np.abs(normal).argmin(axis=1)]  # for faces without a first edge
+    length = np.linalg.norm(edge, axis=1, keepdims=True)
+    across = np.cross(normal, np.where(length > 0, edge / np.maximum(length, 1e-300), least))
+    size = np.linalg.norm(across, axis=1, keepdims=True)
+    across = np.where(size > 1e-3, across / np.maximum(size, 1e-30), trimesh.unitize(np.cross(normal, least)))
+    return np.stack([np.cross(across, normal), across, normal], axis=1)
 
 
 def _facets(mesh: trimesh.Trimesh) -> Int64Array:

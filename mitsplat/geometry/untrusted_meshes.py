@@ -32,7 +32,8 @@ _HEADER = 4096
 _PLAIN_PLY = re.compile(
     rb"ply\r?\nformat binary_little_endian 1\.0\r?\n(?:comment [^\n]*\n)*element vertex (\d{1,12})\r?\n"
     rb"((?:property (?:float|double|uchar|uint8|float32|float64) \w+\r?\n)+)element face (\d{1,12})\r?\n"
-    rb"property list (?:uchar|uint8) (?:int|uint|int32|uint32) vertex_ind(?:ex|ices)\r?\nend_header\r?\n"
+    rb"property list (?:uchar|uint8) (?:int|uint|int32|uint32) vertex_ind(?:ex|ices)\r?\n"
+    rb"(property list uchar float corner_normals\n)?end_header\r?\n"
 )
 _WIDTHS = {b"float": 4, b"float32": 4, b"double": 8, b"float64": 8, b"uchar": 1, b"uint8": 1}
 
@@ -79,7 +80,8 @@ def _is_plain_binary(path: Path, size: int) -> bool:
     if path.suffix.lower() != ".ply" or not (found := _PLAIN_PLY.match(head)):
         return False
     kinds = [line.split()[1] for line in found[2].splitlines()]
-    return size == found.end() + int(found[1]) * sum(_WIDTHS[kind] for kind in kinds) + int(found[3]) * 13
+    face = 50 if found[4] else 13
+    return size == found.end() + int(found[1]) * sum(_WIDTHS[kind] for kind in kinds) + int(found[3]) * face
 
 
 @lru_cache(maxsize=256)

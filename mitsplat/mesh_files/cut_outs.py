@@ -79,6 +79,7 @@ def cut_out(part: FilePart, alpha: Texture, threshold: float, opacity: Float64Ar
         vertices=select(part.vertices[part.faces]).reshape(-1, 3),
         faces=np.arange(3 * len(owner)).reshape(-1, 3),
         colours=None if part.colours is None else select(part.colours),
+        normals=None if part.normals is None else select(part.normals),
         material=replace(
             material,
             texture=select_texture(material.texture),

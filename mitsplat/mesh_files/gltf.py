@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from mitsplat.arrays import AnyArray, Float64Array, Int64Array
 from mitsplat.errors import InputError
+from mitsplat.geometry.mesh_normals import normal_matrix
 from mitsplat.mesh_files.cut_outs import cut_out, opaque_texture
 from mitsplat.mesh_files.gltf_data import GltfData, normalised
 from mitsplat.mesh_files.gltf_nodes import instance_poses, world_poses
@@ -131,13 +132,12 @@ class _GltfReader:
                 continue
             part = self._read_part(node["mesh"], number, weights)
             if "skin" in node:
-                vertices = self._skinned(self._data.entry("skins", node["skin"]), primitive, part.vertices)
-                yield _moved(part, vertices, np.eye(4))
+                yield self._skinned(self._data.entry("skins", node["skin"]), primitive, part)
                 continue
-            yield from (_moved(part, part.vertices, one) for one in poses)
+            yield from (replace(part, transform=one) for one in poses)
 
-    def _skinned(self, skin: JsonObject, primitive: JsonObject, vertices: Float64Array) -> Float64Array:
-        """Return vertices (V, 3) in the pose of the joints of a skin."""
+    def _skinned(self, skin: JsonObject, primitive: JsonObject, part: FilePart) -> FilePart:
+        """Return a part in the pose of the joints of a skin."""
         outside = [joint for joint in skin["joints"] if joint not in self._world_poses]
         if outside:
             raise ValueError(f"joint {outside[0]} of a skin is not in the scene")
@@ -150,9 +150,14 @@ class _GltfReader:
             np.hstack([self._attribute(primitive, f"{name}_{k}") for k in range(sets)])
             for name in ("JOINTS", "WEIGHTS")
         )
-        at = np.pad(vertices, ((0, 0), (0, 1)), constant_values=1.0)
+        at = np.pad(part.vertices, ((0, 0), (0, 1)), constant_values=1.0)
         total = np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
-        return np.asarray(np.einsum("vj,vjab,vb->va", weights / total, poses[joints.astype(int)], at)[:, :3])
+        blended = np.einsum("vj,vjab->vab", weights / total, poses[joints.astype(int)])
+        vertices = np.einsum("vab,vb->va", blended, at)[:, :3]
+        normals = part.normals
+        if normals is not None:
+            normals = np.einsum("fkab,fkb->fka", normal_matrix(blended[:, :3, :3])[part.faces], normals)
+        return replace(part, vertices=vertices, normals=normals)
 
     def _attribute(self, primitive: JsonObject, name: str) -> AnyArray:
         return self._data.accessor(primitive["attributes"][name])
@@ -170,6 +175,7 @@ class _GltfReader:
         faces = _triangles(indices, primitive.get("mode", _TRIANGLES))
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
             raise ValueError(f"a face has vertices {faces.min()} to {faces.max()} of {len(vertices)}")
+        normals = attributes["NORMAL"].astype(np.float64)[faces] if "NORMAL" in attributes else None
         name = str(stored_mesh.get("name", f"mesh_{mesh}"))
         self._names[name] = self._names.get(name, -1) + 1
         name = f"{name}_{self._names[name]}" if self._names[name] else name
@@ -186,11 +192,12 @@ class _GltfReader:
             alpha = stored_colours[..., 3] if stored_colours.shape[2] == 4 else None
         if "material" not in primitive:
             material = UNKNOWN_MATERIAL if colours is None else PAINTED_MATERIAL
-            return FilePart(name, vertices, faces, np.eye(4), material, colours)
+            return FilePart(name, vertices, faces, np.eye(4), material, colours, normals=normals)
         stored = self._data.entry("materials", primitive["material"])
         uv = {int(key[9:]): values[faces] for key, values in attributes.items() if key.startswith("TEXCOORD_")}
         material = self._read_material(stored, uv)
-        part = FilePart(name, vertices, faces, np.eye(4), material, colours, bool(stored.get("doubleSided")))
+        double_sided = bool(stored.get("doubleSided"))
+        part = FilePart(name, vertices, faces, np.eye(4), material, colours, double_sided, normals)
         if stored.get("alphaMode") == "BLEND" and alpha is not None and (alpha < OPAQUE).any():
             material = replace(material, warnings=(*material.warnings, TRANSPARENT_COLOURS))
             return replace(part, material=material)
@@ -217,7 +224,7 @@ class _GltfReader:
             alpha = opaque_texture(len(part.faces))
         if alpha is not None and factor[3] > 0:
             return cut_out(part, alpha, 255.0 * cutoff / factor[3], opacity)
-        return part if factor[3] >= cutoff else replace(part, faces=part.faces[:0])
+        return part if factor[3] >= cutoff else replace(part, faces=part.faces[:0], normals=None)
 
     def _read_arrays(self, primitive: JsonObject) -> tuple[dict[str, AnyArray], Int64Array]:
         """Return the positions, colours and texture coordinates of a primitive, and its indices."""
@@ -227,7 +234,7 @@ class _GltfReader:
             decoded, indices = self._data.draco(compressed)
         attributes = {}
         for name, index in primitive["attributes"].items():
-            if name not in ("POSITION", "COLOR_0") and not name.startswith("TEXCOORD_"):
+            if name not in ("POSITION", "NORMAL", "COLOR_0") and not name.startswith("TEXCOORD_"):
                 if "COLOR" in name.upper() and "COLOR_0" not in primitive["attributes"]:
                     self._warnings.append(f"its vertex colours {name} are left out: only COLOR_0 is read")
                 continue
@@ -241,6 +248,8 @@ class _GltfReader:
             if len(values) != len(attributes["POSITION"]):
                 count = len(attributes["POSITION"])
                 raise ValueError(f"{name} must have the {count} elements of POSITION (got {len(values)})")
+        if "NORMAL" in attributes and attributes["NORMAL"].shape[1] != 3:
+            raise ValueError(f"NORMAL must have 3 components (got {attributes['NORMAL'].shape[1]})")
         if indices is None and "indices" in primitive:
             indices = self._data.accessor(primitive["indices"])
         if indices is None:
@@ -319,10 +328,6 @@ class _GltfReader:
         stored = {} if sampler is None else self._data.entry("samplers", sampler)
         wrap_u, wrap_v = (_WRAPS[stored.get(name, 10497)] for name in ("wrapS", "wrapT"))
         return Texture(pixels, coordinates, (wrap_u, wrap_v))
-
-
-def _moved(part: FilePart, vertices: Float64Array, pose: Float64Array) -> FilePart:
-    return FilePart(part.name, vertices, part.faces, pose, part.material, part.colours, part.double_sided)
 
 
 def _triangles(indices: Int64Array, mode: int) -> Int64Array:

@@ -128,6 +128,8 @@ class FilePart:
         material: The material.
         colours: Linear colours of the face corners that the material's factor multiplies, shape (F, 3, 3), or None.
         double_sided: True if the file states that both sides of the faces are visible.
+        normals: Normals that the file states at the face corners, of any length and before ``transform``, shape
+            (F, 3, 3), or None.
     """
 
     name: str
@@ -137,6 +139,7 @@ class FilePart:
     material: Material
     colours: Float64Array | None = None
     double_sided: bool = False
+    normals: Float64Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import trimesh
 
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.mesh import check_faces
+from mitsplat.geometry.mesh_normals import read_stated_normals
 from mitsplat.geometry.untrusted_meshes import check_mesh, refuse_archive, try_read
 from mitsplat.mesh_files.gltf import read_gltf
 from mitsplat.mesh_files.mesh_file import MeshFile, MeshFrame
@@ -49,6 +50,25 @@ def read_mesh(path: Path, *, merge: bool = True, frame: MeshFrame | None = None)
     if not np.isfinite(mesh.vertices).all():
         row = int(np.argmin(np.isfinite(mesh.vertices).all(axis=1)))
         raise InputError(f"{path}: vertices must be finite (got {mesh.vertices[row].tolist()} at vertex {row})")
+    return mesh
+
+
+def read_proxy(path: Path, *, merge: bool = True) -> trimesh.Trimesh:
+    """Read the proxy mesh of an asset, with the normals that its PLY file states.
+
+    Args:
+        path: The file.
+        merge: Merge vertices at the same position.
+
+    Raises:
+        InputError: If it cannot be read as a mesh, or if its normals break a rule.
+        MissingResourceError: If the package that reads such files is not installed.
+    """
+    mesh = read_mesh(path, merge=merge)
+    try:
+        read_stated_normals(mesh)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
     return mesh
 
 

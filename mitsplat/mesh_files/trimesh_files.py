@@ -42,6 +42,8 @@ _STL_FACE_BYTES = 50
 _NO_MATERIALS = (UNKNOWN_MATERIAL, PAINTED_MATERIAL)
 _COLOUR_NAMES = (("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of colours in PLY files that trimesh does not read."""
+_COORDINATES = (rb"(?<=/)[^/\s]+(?=/)", rb"(?<!/)/[^/\s]*(?!\S)|/+(?!\S)")
+"""Texture coordinates ``t`` of the corners ``v/t/n`` of OBJ faces, and the ends ``/t``, ``/`` and ``//`` of others."""
 _LENGTH = (
     "its data do not have the length that its header states: it is incomplete, or its faces have different numbers of "
     "corners, which is not read from binary PLY files: export it with triangles"
@@ -77,11 +79,12 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
         if kind == ".ply" and "unexpected length" in str(error):
             raise InputError(_LENGTH) from error
         raise
+    normals = _stated_normals(scene) if kind in (".obj", ".ply") else None
     for positions, polygons in _polygons(path, scene, document):
         concave = has_concave(np.asarray(positions), polygons)
         if concave and not (kind in (".ply", ".off") and _split_faces(scene, np.asarray(positions), polygons)):
             raise InputError("it has concave polygons, which are not read from such files: export it with triangles")
-    parts = scene_parts(scene, path)
+    parts = scene_parts(scene, path, normals)
     if document is None:
         warnings = tuple(_warnings(path, scene, content, parts, textures))
         return MeshFile(parts, warnings=warnings, in_single=kind in (".stl", ".ply"))
@@ -100,6 +103,15 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
     return MeshFile(parts, units, up, tuple(collada_warnings(document)))
 
 
+def _stated_normals(scene: trimesh.Scene) -> dict[str, Float64Array]:
+    """Return the normals (V, 3) at the vertices of meshes whose file states them, by the names of the meshes.
+
+    The loaders of trimesh put them into the cache of a new mesh, which is empty otherwise.
+    """
+    found = {name: mesh._cache["vertex_normals"] for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
+    return {name: np.array(values) for name, values in found.items() if values is not None}
+
+
 def _decoded(material: Material) -> Material:
     """Return a material of trimesh, which reads display-encoded factors as linear ones, with the linear factor."""
     return replace(material, factor=decode_srgb(material.factor))
@@ -115,7 +127,8 @@ def _plain_content(path: Path) -> bytes | None:
         if re.search(rb"^mtllib ", content, re.M | re.I):
             return content
         # trimesh leaves out colours of vertices that have texture coordinates.
-        return re.sub(rb"^f .*$", lambda face: re.sub(rb"/\S*", b"", face[0]), content, flags=re.M)
+        without = [re.compile(pattern) for pattern in _COORDINATES]
+        return re.sub(rb"^f .*$", lambda face: without[1].sub(b"", without[0].sub(b"", face[0])), content, flags=re.M)
     if kind == ".ply":
         header = _ply_header(path)
         for names in _COLOUR_NAMES:

@@ -51,12 +51,16 @@ _UNREAD_KEYS = {"bump", "norm", "disp", "decal", "refl", *_UNREAD_MAPS}
 """Keys of MTL files that are left out with a warning."""
 
 
-def scene_parts(mesh: trimesh.Trimesh | trimesh.Scene, source: object) -> tuple[FilePart, ...]:
+def scene_parts(
+    mesh: trimesh.Trimesh | trimesh.Scene, source: object, normals: Mapping[str, Float64Array] | None = None
+) -> tuple[FilePart, ...]:
     """Return the parts of a mesh or of a scene, in the units and axes of its positions.
 
     Args:
         mesh: The mesh or scene.
         source: Name of the mesh in messages.
+        normals: Normals (V, 3) that a file states at the vertices of its meshes, by their names. Those of trimesh are
+            not read, because it computes absent ones.
 
     Raises:
         InputError: If a face refers to a missing vertex, or if a texture is damaged.
@@ -69,9 +73,11 @@ def scene_parts(mesh: trimesh.Trimesh | trimesh.Scene, source: object) -> tuple[
         if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
             check_faces(geometry, source)
             try:
-                parts.append(_read_part(str(name), geometry, np.asarray(transform)))
+                part = _read_part(str(name), geometry, np.asarray(transform))
             except InputError as error:
                 raise InputError(f"{source}: part {name}: {error}") from error
+            stated = (normals or {}).get(name)
+            parts.append(part if stated is None else replace(part, normals=stated[part.faces]))
     return tuple(parts)
 
 

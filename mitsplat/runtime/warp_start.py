@@ -1,4 +1,4 @@
-"""Initialisation of Warp without its banner and without the warning on machines without a GPU."""
+"""Initialisation of Warp without its banner and without the warnings in processes that see no GPU."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from mitsplat.errors import FULL
 from mitsplat.storage.cache import prepare_caches
 
 _started = False
-_NO_GPU = b"Could not find or load the NVIDIA CUDA driver"
+_NO_GPU = b"Could not find or load the NVIDIA CUDA driver", b"Warp CUDA error 100: no CUDA-capable device"
+"""Phrases of Warp's warnings without a driver, and with a driver if ``CUDA_VISIBLE_DEVICES`` hides all GPUs."""
 
 
 @contextmanager
 def quiet_warp() -> Iterator[None]:
     """Initialise Warp and limit its log to errors; also usable as a function decorator.
 
-    The warning about a missing GPU, which no setting disables, is filtered out. An error about a full disk gets the
+    The warnings about a missing GPU, which no setting disables, are filtered out. An error about a full disk gets the
     folder of Warp's kernels as file name, because no other files are written here.
     """
     import warp as wp  # takes a third of a second, which only physics needs
@@ -43,8 +44,8 @@ def quiet_warp() -> Iterator[None]:
 
 
 @contextmanager
-def _stderr_without(phrase: bytes) -> Iterator[None]:
-    """Remove lines with a phrase from the stderr output of native code."""
+def _stderr_without(phrases: tuple[bytes, ...]) -> Iterator[None]:
+    """Remove lines with one of the phrases from the stderr output of native code."""
     if sys.stderr is not None:
         sys.stderr.flush()
     try:
@@ -60,4 +61,4 @@ def _stderr_without(phrase: bytes) -> Iterator[None]:
             os.dup2(kept, 2)
             os.close(kept)
             written.seek(0)
-            os.write(2, b"".join(line for line in written if phrase not in line))
+            os.write(2, b"".join(line for line in written if not any(phrase in line for phrase in phrases)))

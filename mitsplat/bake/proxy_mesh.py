@@ -11,6 +11,7 @@ import trimesh
 
 from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.geometry.mesh import simplify_solid
+from mitsplat.geometry.mesh_holes import close_holes
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 
 _LABEL_GAP = 0.01
@@ -27,7 +28,7 @@ def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
     Open sheets are not decimated, because decimation would shrink them from their edges. Flat sheets are
     re-triangulated from their outlines.
     """
-    meshes = [_close_holes(part.mesh) for part in parts]
+    meshes = [_close_solid(part.mesh) for part in parts]
     solids = [mesh for mesh in meshes if mesh.is_volume]
     sheets = [mesh for mesh in meshes if not mesh.is_volume]
     if len(solids) > 1:
@@ -72,12 +73,9 @@ def _simplify(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
     return next((mesh for mesh in closed if len(mesh.faces) <= most), fewer)
 
 
-def _close_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def _close_solid(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Close small holes of a solid, such as missing triangles of a scan; return any other mesh unchanged."""
-    if mesh.is_watertight:
-        return mesh
-    closed = mesh.copy()
-    closed.fill_holes()
+    closed = close_holes(mesh)
     return closed if closed.is_volume else mesh
 
 

@@ -22,6 +22,7 @@ from mitsplat.arrays import Float64Array
 from mitsplat.geometry.hull_fit import fit_to_hull
 from mitsplat.geometry.mesh import SHARP, contact_points, simplify_solid
 from mitsplat.geometry.mesh_distance import DistanceSurface, max_outside_distance
+from mitsplat.geometry.mesh_holes import close_holes
 from mitsplat.storage.cache import cache_folder, write_cache_file
 from mitsplat.storage.content_hash import ContentHash
 
@@ -89,7 +90,7 @@ def convex_pieces(
 @lru_cache(maxsize=256)
 def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, max_pieces: int) -> tuple[trimesh.Trimesh, ...]:
     libraries = f"{version('coacd')} {version('manifold3d')}"  # of meshes with few faces, and of scans
-    digest = ContentHash("pieces 6", f"{libraries} {threshold!r} {max_pieces}", vertices, faces)
+    digest = ContentHash("pieces 7", f"{libraries} {threshold!r} {max_pieces}", vertices, faces)
     path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:
@@ -103,8 +104,7 @@ def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, max_pieces: 
 
 def _parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     """Return the closed solids of a mesh, without cavities; or the mesh itself if it is open."""
-    if not mesh.is_watertight:
-        mesh.fill_holes()  # scans lack a few triangles
+    mesh = close_holes(mesh)  # scans lack a few triangles
     if not mesh.is_watertight:
         return [mesh]
     parts = [part for part in mesh.split(only_watertight=False) if part.volume > 0]

@@ -13,6 +13,7 @@ import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
+from mitsplat.geometry.mesh_holes import close_holes
 
 _logger = logging.getLogger(__name__)
 
@@ -82,7 +83,7 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     welded.update_faces(welded.nondegenerate_faces())
     welded.remove_unreferenced_vertices()
     if solid:
-        welded.fill_holes()  # of three or four edges, where slivers were removed
+        welded = close_holes(welded)  # where slivers were removed
     # Divergence theorem: sum of the tetrahedra from the centre to each triangle. Holes matter least from there.
     volume = float(np.linalg.det(welded.triangles - mesh.bounds.mean(axis=0)).sum()) / 6
     if volume < 0 and (solid or welded.is_watertight):  # an open scan has no inside

@@ -41,3 +41,21 @@ def test_touching_solids_form_a_closed_proxy(sections: int, turn: tuple[float, f
     assert proxy.is_volume
     assert proxy.volume == pytest.approx(cap.volume + shaft.volume, rel=1e-6)
     assert proxy.extents == pytest.approx(trimesh.util.concatenate([cap, shaft]).extents, rel=1e-5)
+
+
+def test_a_scan_without_some_neighbouring_faces_has_a_closed_proxy() -> None:
+    """An open proxy would take the convex decomposition minutes, and have hundreds of pieces."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    lost = np.argsort(ball.triangles_center[:, 2])[:7]
+    scan = trimesh.Trimesh(ball.vertices, np.delete(ball.faces, lost, axis=0))
+    proxy = make_proxy([part(scan)], 4000)
+    assert proxy.is_volume
+    assert proxy.volume == pytest.approx(ball.volume, rel=0.002)
+
+
+def test_the_proxy_of_a_box_without_a_lid_is_open() -> None:
+    box = trimesh.creation.box((0.3, 0.2, 0.1))
+    crate = trimesh.Trimesh(box.vertices, box.faces[box.face_normals[:, 2] < 0.5])
+    proxy = make_proxy([part(crate)], 4000)
+    assert not proxy.is_watertight
+    assert proxy.area == pytest.approx(crate.area)

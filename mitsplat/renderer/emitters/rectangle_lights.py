@@ -1,7 +1,7 @@
 """Table of rectangular area lights of uniform radiance, evaluated without calls of Mitsuba's plugins.
 
-Most lamps are of this kind. Their unoccluded light in closed form takes 0.1 to 0.5 times the time of 34 points, and has
-no error.
+Most lamps are of this kind. Their unoccluded light in closed form takes 0.1 to 0.5 times the time of 34 points, and its
+only error is rounding.
 """
 
 from __future__ import annotations
@@ -81,6 +81,9 @@ class Rectangles:
 
         It is half the radiance times the sum of angle and axis along the normal of all edges of the part above the
         horizon (Lambert 1760, "Photometria").
+
+        The terms nearly cancel for a small distant lamp: the rounding error is up to 0.5 % of the irradiance of a lamp
+        of 4 x 8 mm at 7 m, and falls with size over distance.
         """
         count, lanes = dr.opaque(mi.UInt32, dr.width(self.rows) // _Columns.WIDTH), dr.width(place)
 

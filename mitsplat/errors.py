@@ -52,9 +52,11 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def _is_interrupt(error: BaseException | None) -> bool:
     """Return True for a keyboard interrupt, including one that Dr.Jit has wrapped in an error of its own."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
+    seen = set()
+    while error is not None and not isinstance(error, KeyboardInterrupt) and id(error) not in seen:
+        seen.add(id(error))  # an error that was raised from itself is its own cause
         error = error.__cause__ or error.__context__
-    return error is not None
+    return isinstance(error, KeyboardInterrupt)
 
 
 def exit_status(error: BaseException) -> int | None:

@@ -46,3 +46,11 @@ def test_a_full_disk_is_named_by_the_file_that_is_written(tmp_path: Path) -> Non
     with pytest.raises(MissingResourceError, match=message), storage_errors(tmp_path):
         raise error
     assert sentence_of(OSError(errno.ENOENT, "No such file", "source.jpg", None, "copy.jpg")).startswith("source.jpg")
+
+
+def test_an_error_that_is_its_own_cause_has_a_status() -> None:
+    """Such an error once kept the command line in an endless loop."""
+    error, interrupt = InputError("a mesh without its material file"), RuntimeError("a wrapped interrupt")
+    error.__cause__, interrupt.__cause__ = error, KeyboardInterrupt()
+    assert exit_status(error) == 2
+    assert exit_status(interrupt) == 130

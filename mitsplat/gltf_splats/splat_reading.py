@@ -66,7 +66,9 @@ def read_gltf_splats(path: Path) -> Splats:
     try:
         return _read(path, warn=True)
     except InputError as error:
-        raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
+        if str(error).startswith(str(path)):
+            raise
+        raise InputError(f"{path}: {error}") from error
     except (OSError, *MESH_ERRORS) as error:
         raise InputError(f"{path}: not a glTF file that can be read ({error})") from error
 

@@ -125,8 +125,9 @@ def read_mesh_file(path: Path, *, textures: bool = True) -> MeshFile:
     try:
         return _read(path, textures=textures)
     except InputError as error:
-        named = str(error).startswith(f"{path.parent}/") or str(error).startswith(str(path))
-        raise error if named else InputError(f"{path}: {error}") from error
+        if str(error).startswith((f"{path.parent}/", str(path))):
+            raise
+        raise InputError(f"{path}: {error}") from error
     except MissingResourceError:
         raise
     except (OSError, *MESH_ERRORS) as error:

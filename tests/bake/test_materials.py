@@ -263,8 +263,9 @@ def test_missing_textures_are_refused_unless_a_colour_is_given(tmp_path: Path) -
         read_parts(path)
     assert read_parts(path, finish=SurfaceFinish(colour="red"))
     (tmp_path / "box.mtl").unlink()
-    with pytest.raises(InputError, match=r"box\.obj: its material file box\.mtl is missing"):
+    with pytest.raises(InputError, match=r"box\.obj: its material file box\.mtl is missing") as missing:
         read_parts(path)
+    assert missing.value.__cause__ is not missing.value
 
 
 @pytest.mark.parametrize("name", ["../colour.png", "{folder}/colour.png", "link.png"])

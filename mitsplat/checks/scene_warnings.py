@@ -6,6 +6,8 @@ stop a run are in :mod:`mitsplat.dataset.preflight`.
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Iterable, Iterator, Sequence, Set
 
 import numpy as np
@@ -59,6 +61,7 @@ def scene_warnings(scene: Scene) -> Iterator[Finding]:
     yield from _backdrop_warnings(scene, cameras, drawn)
     yield from _light_warnings(scene, drawn)
     yield from _bin_warnings(scene)
+    yield from _class_warnings(scene)
 
 
 def _is_repeated(scene: Scene, one: FramePlan) -> bool:
@@ -115,6 +118,18 @@ def _bin_warnings(scene: Scene) -> Iterator[Finding]:
         elif len(regions) == 1 and shares[0] < MIN_SHARE_IN_BIN:
             text = f"region: only {shares[0]:.0%} of it is above the bin {shape.name!r}"
             yield fault("bin", text, "make region smaller than the bin, or objects fall beside it")
+
+
+def _class_warnings(scene: Scene) -> Iterator[Finding]:
+    """Warn of class names that are probably one class: they differ in case, blanks, or the encoding of accents."""
+    spellings: dict[str, list[str]] = {}
+    for name in scene.class_names:
+        plain = re.sub(r"[\s_-]+", "_", unicodedata.normalize("NFKC", name).casefold()).strip("_")
+        spellings.setdefault(plain, []).append(name)
+    for names in spellings.values():
+        if len(names) > 1:
+            text = f"objects: classes {' and '.join(map(repr, names))} differ only in case, blanks or accents' encoding"
+            yield fault("classes", text, "if they are one class, write one name: class_name, or class of asset.yaml")
 
 
 def _cost_warnings(scene: Scene) -> Iterator[Finding]:

@@ -169,6 +169,23 @@ def test_a_region_outside_of_the_bin_is_reported(position, region, text, scene_d
     assert found == ([] if text is None else [text])
 
 
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (("housing", "Housing"), "classes 'Housing' and 'housing' differ only in case, blanks or accents' encoding"),
+        (("hex nut", "hex_nut "), "classes 'hex nut' and 'hex_nut ' differ only in case, blanks or accents' encoding"),
+        (("Geh\u00e4use", "Geha\u0308use"), "classes 'Geha\u0308use' and 'Geh\u00e4use' differ only in case, "),
+        (("M8x1.5", "M8x15"), None),
+        (("housing", "housing"), None),
+    ],
+)
+def test_classes_that_differ_only_in_spelling_are_reported(names, text, scene_data, write_scene):
+    entries = [entry | {"class_name": name} for entry, name in zip(scene_data["objects"], names, strict=True)]
+    scene = load_scene(write_scene(scene_data | {"objects": entries}))
+    found = [finding.text for finding in scene_warnings(scene) if finding.name == "classes" and not finding.ok]
+    assert (not found) if text is None else (len(found) == 1 and text in found[0]), found
+
+
 def test_check_warns_of_slow_settling_and_of_large_images(scene_data, write_scene, monkeypatch):
     scene_data["objects"][0]["count"] = [100, 200]
     scene_data["output"] |= {"width": 3000, "height": 3000}

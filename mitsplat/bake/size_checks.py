@@ -38,10 +38,12 @@ def _check_object_size(source: str, size: float, metres_per_unit: float) -> None
     """Refuse objects whose size [m] indicates wrong units."""
     if _MIN_OBJECT_SIZE <= size <= _MAX_OBJECT_SIZE:
         return
-    factor, unit = (0.001, "millimetres") if size > _MAX_OBJECT_SIZE else (1000.0, "metres")
+    factor = 0.001 if size > _MAX_OBJECT_SIZE else 1000.0
     likely = ""
     if _MIN_OBJECT_SIZE <= size * factor <= _MAX_OBJECT_SIZE:
-        likely = f"--units {metres_per_unit * factor:g} reads it in {unit}, and "
+        units = f"{metres_per_unit * factor:g}"
+        unit = {"1": " in metres", "0.01": " in centimetres", "0.001": " in millimetres"}.get(units, "")
+        likely = f"--units {units} reads it{unit or f' at {size * factor:.3g} m'}, and "
     raise InputError(
         f"{source}: an object must be {_MIN_OBJECT_SIZE:g} to {_MAX_OBJECT_SIZE:g} m across (got {size:.3g} m at "
         f"{metres_per_unit:g} metres per unit: {likely}--any-size accepts the size)"

@@ -300,6 +300,14 @@ def not_finite() -> trimesh.Trimesh:
             {"mesh": trimesh.creation.box((0.04, 0.01, 0.01)), "metres_per_unit": 0.001},
             r"got 4e-05 m at 0.001 metres per unit: --units 1 reads it in metres, and --any-size accepts the size",
         ),
+        (
+            {"mesh": trimesh.creation.box((40, 10, 10)), "metres_per_unit": 1e-6},
+            r"got 4e-05 m at 1e-06 metres per unit: --units 0.001 reads it in millimetres, and",
+        ),
+        (
+            {"mesh": trimesh.creation.box((40, 10, 10)), "metres_per_unit": 0.0254 * 10},
+            r"got 10.2 m at 0.254 metres per unit: --units 0.000254 reads it at 0.0102 m, and",
+        ),
         ({"mesh": trimesh.Trimesh(np.eye(3), [[0, 1, 2]])}, "an object must have a volume .got a flat mesh."),
         ({"density": 0.0}, "density must be a number > 0 .* .got 0."),
         ({"density": float("nan")}, "density must be a number > 0 .* .got nan."),

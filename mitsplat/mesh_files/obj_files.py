@@ -104,6 +104,26 @@ def obj_warnings(content: bytes, parts: tuple[FilePart, ...]) -> Iterator[str]:
         yield "the colours of its vertices are left out, because its faces have materials: remove mtllib to use them"
 
 
+def obj_fault(content: bytes) -> str:
+    """Return a sentence about the first wrong number in an OBJ file, or an empty text if there is none."""
+    lines = [line.split() for line in plain_text(content).splitlines()]
+    count = sum(words[:1] == [b"v"] for words in lines)
+    for number, words in enumerate(lines, 1):
+        got = b" ".join(words).decode(errors="replace")
+        if words[:1] == [b"v"]:
+            try:
+                is_finite = bool(np.isfinite(np.array(words[1:], dtype=np.float64)).all())
+            except ValueError:
+                is_finite = False
+            if not is_finite:
+                return f"line {number}: vertices must be finite numbers (got {got})"
+        if words[:1] == [b"f"]:
+            corners = [word.partition(b"/")[0] for word in words[1:]]
+            if not all(re.fullmatch(rb"-?\d+", corner) and 1 <= abs(int(corner)) <= count for corner in corners):
+                return f"line {number}: faces must name vertices from 1 to {count}, the number in the file (got {got})"
+    return ""
+
+
 def values_of(path: Path, content: bytes, key: str) -> list[str]:
     """Return the values of all lines of an OBJ or MTL file that begin with a key.
 
@@ -159,6 +179,9 @@ def _check_library(path: Path, folder: Path) -> list[str]:
     for key in ("ka", "kd", "ks"):
         for colour in values_of(path, content, key):
             _check_colour(path, key, colour)
+    for key in ("pr", "pm"):
+        for value in values_of(path, content, key):
+            _check_share(path, key, value)
     names = values_of(path, content, "newmtl")
     bodies = [body.strip() for body in re.split(rb"^newmtl .*$", content, flags=re.M | re.I)[1:]]
     first: dict[str, bytes] = {}
@@ -177,6 +200,16 @@ def _check_colour(path: Path, key: str, colour: str) -> None:
     if len(values) != 3 or (key == "kd" and values.max() > MAX_FRACTION):
         name = key.capitalize()
         raise InputError(f"{path}: {name} must be red, green and blue from 0 to 1 (got {name} {colour})")
+
+
+def _check_share(path: Path, key: str, value: str) -> None:
+    try:
+        is_share = 0 <= float(value) <= 1
+    except ValueError:
+        is_share = False
+    if not is_share:
+        meaning, name = {"pr": "roughness", "pm": "metalness"}[key], key.capitalize()
+        raise InputError(f"{path}: {name}, the {meaning}, must be a number from 0 to 1 (got {name} {value})")
 
 
 def check_texture(path: Path, texture: str, folder: Path) -> None:

@@ -29,7 +29,14 @@ from mitsplat.mesh_files.collada_files import (
 from mitsplat.mesh_files.face_polygons import Polygon, has_concave, plain_obj, split_polygons
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import MAX_FRACTION, PAINTED_MATERIAL, UNKNOWN_MATERIAL, FilePart, Material, MeshFile
-from mitsplat.mesh_files.obj_files import check_obj_materials, check_texture, obj_warnings, plain_text, values_of
+from mitsplat.mesh_files.obj_files import (
+    check_obj_materials,
+    check_texture,
+    obj_fault,
+    obj_warnings,
+    plain_text,
+    values_of,
+)
 from mitsplat.mesh_files.trimesh_parts import scene_parts
 
 if TYPE_CHECKING:
@@ -71,13 +78,15 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
     if kind == ".ply":
         _check_elements(_ply_header(path))
     document = _collada_document(path) if kind == ".dae" else None
-    content = _plain_content(path)
-    file = path if content is None else io.BytesIO(content)
     try:
+        content = _plain_content(path)
+        file = path if content is None else io.BytesIO(content)
         scene = trimesh.load_scene(file, file_type=kind[1:], resolver=_Resolver(path), process=False)
-    except ValueError as error:
+    except (ValueError, IndexError) as error:
         if kind == ".ply" and "unexpected length" in str(error):
             raise InputError(_LENGTH) from error
+        if kind == ".obj" and (fault := obj_fault(path.read_bytes())):
+            raise InputError(fault) from error
         raise
     normals = _stated_normals(scene) if kind in (".obj", ".ply") else None
     for positions, polygons in _polygons(path, scene, document):

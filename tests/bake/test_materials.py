@@ -216,6 +216,20 @@ def test_mtl_and_matt_materials_reach_the_gaussians(tmp_path: Path) -> None:
         np.testing.assert_allclose(values, [expected] * len(found), atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("Pr 30", r"box\.mtl: Pr, the roughness, must be a number from 0 to 1 \(got Pr 30\)"),
+        ("Pm steel", r"box\.mtl: Pm, the metalness, must be a number from 0 to 1 \(got Pm steel\)"),
+        ("Pm nan", r"box\.mtl: Pm, the metalness, must be a number from 0 to 1 \(got Pm nan\)"),
+    ],
+)
+def test_mtl_roughness_and_metalness_out_of_range_are_refused(tmp_path: Path, line: str, sentence: str) -> None:
+    """They were limited to the range, or left out."""
+    with pytest.raises(InputError, match=sentence):
+        read_parts(write_obj(tmp_path, line))
+
+
 def test_texture_without_a_factor_is_not_scaled() -> None:
     image = Image.new("RGB", (4, 4), COLOUR)
     np.testing.assert_array_equal(read_material(SimpleMaterial(image=image)).factor, 1.0)

@@ -72,18 +72,10 @@ def test_polygons_keep_their_texture_coordinates_and_continue_on_the_next_line(t
     np.testing.assert_allclose(part.material.texture.uv, part.vertices[part.faces][..., :2] / 5, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("faces", "sentence"),
-    [
-        ("f 0 1 2", "indices of faces must begin with 1"),
-        ("f 1 2 -9", "a face refers to vertices -5 to 2 of 3"),
-        ("f 1 2 3 4", "a face refers to vertices 1 to 4 of 3"),
-        ("f 1 2 x3 4", "invalid literal"),
-    ],
-)
-def test_damaged_faces_of_obj_are_refused(tmp_path: Path, faces: str, sentence: str) -> None:
-    (tmp_path / "a.obj").write_text(f"{rows_of(TRIANGLE)}{faces}\n")
-    with pytest.raises(InputError, match=sentence):
+@pytest.mark.parametrize("face", ["f 0 1 2", "f 1 2 -9", "f 1 2 3 4", "f 1 2 x3 4"])
+def test_damaged_faces_of_obj_are_refused(tmp_path: Path, face: str) -> None:
+    (tmp_path / "a.obj").write_text(f"{rows_of(TRIANGLE)}{face}\n")
+    with pytest.raises(InputError, match=rf"a\.obj: line 4: faces must name vertices from 1 to 3, .* \(got {face}\)"):
         read_mesh_file(tmp_path / "a.obj")
 
 

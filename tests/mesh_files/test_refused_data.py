@@ -174,3 +174,20 @@ def test_faces_of_ply_without_a_list_of_vertices_are_refused_by_name(tmp_path: P
     )
     with pytest.raises(InputError, match=r"must have a list vertex_indices \(got vertexindices\): rename it"):
         read_model(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("row", "sentence"),
+    [
+        ("v 0 0 1e", r"a\.obj: line 6: vertices must be finite numbers \(got v 0 0 1e\)"),
+        ("v 1,5 0 0", r"a\.obj: line 6: vertices must be finite numbers \(got v 1,5 0 0\)"),
+        ("f 1 2 99", r"a\.obj: line 6: faces must name vertices from 1 to 4, the number in the file \(got f 1 2 99\)"),
+        ("f 1/1 2/1 0/1", r"a\.obj: line 6: faces must name vertices from 1 to 4, .* \(got f 1/1 2/1 0/1\)"),
+    ],
+)
+def test_wrong_numbers_of_obj_are_named_with_their_line(tmp_path: Path, row: str, sentence: str) -> None:
+    rows = ["# a tetrahedron", *(f"v {x} {y} {z}" for x, y, z in POINTS), row]
+    rows += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in FACES]
+    (tmp_path / "a.obj").write_text("\n".join(rows))
+    with pytest.raises(InputError, match=sentence):
+        read_model(tmp_path / "a.obj")

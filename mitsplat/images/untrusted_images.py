@@ -66,6 +66,7 @@ def _try_images(files: tuple[_Stamp, ...]) -> tuple[int, str | None]:
 def _read_images(output: BinaryIO, _: bytes, *arguments: str) -> None:
     """Read images, each within the memory limit that follows its path, and write one line per image."""
     import mitsuba as mi  # imported only in the child process
+    import numpy as np
 
     from mitsplat.runtime.threads import ensure_threads  # imports Dr.Jit
 
@@ -75,9 +76,12 @@ def _read_images(output: BinaryIO, _: bytes, *arguments: str) -> None:
         limit_memory(int(limit), final=False)
         check_exr_header(Path(path))
         try:
-            mi.Bitmap(path)
+            pixels = np.array(mi.Bitmap(path), copy=False)
         except RuntimeError as error:
             remedy = next((text for part, text in _REMEDIES.items() if part in str(error)), None)
             raise error if remedy is None else ValueError(remedy) from None
+        low, high = float(pixels.min()), float(pixels.max())  # both are NaN if one pixel is
+        if not (low >= 0 and np.isfinite(high)):
+            raise ValueError(f"its pixels must be finite and >= 0 (got {low:g} to {high:g}): replace them by 0")
         output.write(b"\n")
         output.flush()

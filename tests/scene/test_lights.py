@@ -220,6 +220,14 @@ def test_lights_that_may_be_inside_of_a_shape_get_a_warning(lit: Any) -> None:
             "lights[0].pool: must name at least one image (got 'no/*', which matches none",
         ),
         ({"kind": "environment", "pool": ["a.exr"], "image": "b.exr"}, "lights[0].pool: must not be given together"),
+        (
+            {"kind": "environment", "image": "b.exr", "colour": [1, 0.2, 0.2]},
+            "lights[0].colour: must not be given together with an image, which has the colours",
+        ),
+        (
+            {"kind": "environment", "pool": ["b.exr"], "draw": {"colour": [[1, 1, 1], [1, 0.5, 0.5]]}},
+            "lights[0].draw.colour: must not be given together with an image, which has the colours",
+        ),
         ({"kind": "environment", "pool": ["/etc/a.exr"]}, "lights[0].pool[0]: must be inside the scene's folder"),
         ({"kind": "environment", "pool": "../*.png"}, "lights[0].pool: must be inside the scene's folder"),
         ({"kind": "room", "size": 0}, "lights[0].size: must be > 0 (got 0)"),

@@ -188,7 +188,9 @@ class EnvironmentLight(DrawnLight):
     kind: Literal["environment"] = Field("environment", description="Environment light from all directions.")
     radiance: Positive = Field(1.0, description="Radiance [W/(m^2 sr)], or the factor on the image.")
     colour: EmittedColour = (1, 1, 1)
-    image: str | None = Field(None, description="HDR or EXR file, relative to the scene file.")
+    image: str | None = Field(
+        None, description="HDR or EXR file, relative to the scene file. Not together with ``colour``."
+    )
     pool: str | tuple[str, ...] | None = optional_field(
         "List of HDR or EXR files, a folder, or a pattern such as ``skies/*``, whose images are sorted "
         "by name. Each layout draws one image, even if other values vary from frame to frame."
@@ -197,6 +199,11 @@ class EnvironmentLight(DrawnLight):
 
     @model_validator(mode="after")
     def _check(self) -> EnvironmentLight:
+        drawn = self.draw is not None and self.draw.colour is not None
+        if (self.image is not None or self.pool is not None) and (drawn or self.colour != (1, 1, 1)):
+            raise FieldError(
+                "draw.colour" if drawn else "colour", "must not be given together with an image, which has the colours"
+            )
         if self.pool is None:
             return self
         if self.image is not None:

@@ -260,7 +260,8 @@ def test_surfaces_without_material_are_invisible(sky: bool) -> None:
         np.array(make_integrator(shadow_error=0, shadow_samples=16).render(mi.load_dict(shared | more, parallel=False)))
         for more in ({"box": box}, {})
     )
-    np.testing.assert_array_equal(with_box, without)
+    # Shapes have another order without the box, so that sums of up to 16 terms may be rounded differently.
+    np.testing.assert_allclose(with_box, without, rtol=16 * 2.0**-24, atol=16 * 2.0**-24)
 
 
 def make_scene_in_a_box() -> Any:

@@ -317,8 +317,11 @@ def storage_errors(folder: Path) -> Iterator[None]:
     except OSError as error:
         place = failed_path(error) or folder
         if error.errno in FULL:
+            remedy = "free disk space"
+            if error.errno == errno.EFBIG:
+                remedy = "raise the limit of file sizes (ulimit -f), or use another disk"
             raise MissingResourceError(
-                f"{place}: {error.strerror}: free disk space and run again; finished files are kept"
+                f"{place}: {error.strerror}: {remedy} and run again; finished files are kept"
             ) from error
         raise InputError(f"{place}: cannot be written or read ({error.strerror or error})") from error
 

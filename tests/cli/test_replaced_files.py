@@ -51,7 +51,7 @@ def test_a_failed_save_keeps_the_earlier_asset(tmp_path: Path, monkeypatch: pyte
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
 
     monkeypatch.setattr("trimesh.Trimesh.export", full)
-    with pytest.raises(MissingResourceError, match="File too large: free disk space"):
+    with pytest.raises(MissingResourceError, match="File too large: raise the limit of file sizes"):
         box_asset("plate", (0.1, 0.1, 0.01)).save(tmp_path)
     assert contents(tmp_path) == before
     monkeypatch.undo()

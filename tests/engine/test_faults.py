@@ -149,7 +149,7 @@ def test_a_file_size_limit_ends_with_one_sentence_and_resumes(scene, tmp_path, u
     for size in (3000, 20000, 40000):
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
         try:
-            with pytest.raises(MissingResourceError, match="File too large: free disk space and run again"):
+            with pytest.raises(MissingResourceError, match="File too large: raise the limit of file sizes"):
                 write(scene, out)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -22,9 +23,10 @@ from mitsplat.errors import InputError
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.light_properties import light_properties
 from mitsplat.frames.scene_builder import NO_SPLATS, asset_properties
-from mitsplat.frames.untrusted_xml import check_xml
+from mitsplat.frames.untrusted_xml import CheckedXml, check_xml
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.images.untrusted_images import check_images
 from mitsplat.physics.settle import settle_layout
 from mitsplat.progress import Note
 from mitsplat.renderer.layers import describe_sensor
@@ -163,6 +165,7 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
     ensure_variant()
     path, out = Path(path), Path(out)
     checked = check_xml(path, allow_outside=allow_outside)
+    _check_skies(checked)
     picture = out if out.suffix.lower() in (".png", ".jpg", ".exr") else out / "picture.png"
     with storage_errors(picture):
         picture.parent.mkdir(parents=True, exist_ok=True)
@@ -180,6 +183,24 @@ def render_xml(path: str | Path, out: str | Path, *, allow_outside: bool = False
     with storage_errors(picture), library_errors(picture):
         write_file(picture, lambda part: bitmap.write(str(part), kind))
     return picture
+
+
+def _check_skies(checked: CheckedXml) -> None:
+    """Refuse environment maps that cannot be read, or whose pixels no light has, which would take all memory.
+
+    Raises:
+        InputError: For the first such image.
+    """
+    emitters = [one for text in checked.texts for one in ElementTree.fromstring(text).iter("emitter")]
+    skies = [
+        sky
+        for emitter in emitters
+        if emitter.get("type") == "envmap"
+        for value in emitter.iter("string")
+        if value.get("name") == "filename" and (sky := Path(value.get("value", ""))).is_file()
+    ]
+    for reason in filter(None, check_images(skies)):
+        raise InputError(reason)
 
 
 def render_apart(path: Path, out: Path, *, allow_outside: bool = False, device: Device | None = None) -> Path:

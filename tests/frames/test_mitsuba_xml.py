@@ -132,6 +132,16 @@ def test_an_error_without_a_line_is_kept() -> None:
     assert describe_error(Path("a.xml"), "") == "a.xml: Mitsuba reported an error without a message"
 
 
+@pytest.mark.usefixtures("files_tried")
+def test_an_environment_map_with_negative_pixels_is_refused(small: Path) -> None:
+    """Mitsuba's process took all memory."""
+    mi.Bitmap(np.full((8, 16, 3), -1.0, dtype=np.float32)).write(str(small / "sky.exr"))
+    sky = '<emitter type="envmap"> <string name="filename" value="sky.exr"/> </emitter>'
+    path = write(small, SCENE.format(NUT.format("") + sky))
+    with pytest.raises(InputError, match=r"sky\.exr: not a readable image \(its pixels must be finite and >= 0"):
+        render_xml(path, small / "picture.png")
+
+
 def test_a_camera_with_shear_is_refused(small: Path) -> None:
     sensor = (
         f'<sensor type="opencv_camera">{FILM} <float name="fx" value="8"/> <float name="fy" value="8"/> '

@@ -12,7 +12,9 @@ from trimesh.grouping import group_rows
 from mitsplat.arrays import Float64Array, Int64Array
 
 _MAX_SHARE = 0.005
-"""Maximum area of a hole, relative to the area of the mesh. The opening of a box or of a cup is larger."""
+"""Maximum area of a hole, relative to the area of its body. The opening of a box or of a cup is larger."""
+_FLAT = 0.999
+"""Area of a hole of three edges, relative to that of its body, above which the body is a flat sheet in this outline."""
 _MAX_EDGES = 100
 """Maximum number of edges of a hole, because the time grows with its third power: 0.1 s for 100 edges."""
 
@@ -20,31 +22,40 @@ _MAX_EDGES = 100
 def close_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return a mesh whose small holes are closed; a closed mesh is returned unchanged.
 
-    Small holes have an area of at most 0.5 % of the mesh, or three edges. Each gets its triangulation of minimum area
-    (Barequet and Sharir, *Filling Gaps in the Boundary of a Polyhedron*, 1995). Larger openings stay open.
+    Small holes have three edges, or an area of at most 0.5 % of the connected faces around them. Each gets its
+    triangulation of minimum area (Barequet and Sharir, *Filling Gaps in the Boundary of a Polyhedron*, 1995). Larger
+    openings stay open, and sheets stay sheets, also beside larger bodies in the same mesh.
     """
     if mesh.is_watertight:
         return mesh
-    edges = set(map(tuple, mesh.edges_sorted.tolist()))
+    body = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    sizes = np.bincount(body, weights=mesh.area_faces)[body][mesh.edges_face]
+    single = group_rows(mesh.edges_sorted, require_count=1)
+    vertices, ends = np.asarray(mesh.vertices), np.asarray(mesh.edges)[:, 1]
+    on_outline = np.zeros(len(mesh.vertices), dtype=bool)
+    on_outline[mesh.edges[single]] = True
+    edges = set(map(tuple, mesh.edges_sorted[on_outline[mesh.edges_sorted].all(axis=1)].tolist()))
     found: list[Int64Array] = []
-    for hole in _holes(mesh):
-        if len(hole) > _MAX_EDGES:
+    for rim in _holes(mesh, single):
+        if len(rim) > _MAX_EDGES:
             continue
-        triangles, area = _smallest_patch(hole, mesh.vertices[hole], edges)
-        if area <= (_MAX_SHARE * mesh.area if len(hole) > 3 else np.inf):
+        hole = ends[rim]
+        triangles, area = _smallest_patch(hole, vertices[hole], edges)
+        if area <= (_MAX_SHARE if len(hole) > 3 else _FLAT) * sizes[rim].max():
             found.append(triangles)
     if not found:
         return mesh
     return trimesh.Trimesh(mesh.vertices, np.concatenate([mesh.faces, *found]), process=False)
 
 
-def _holes(mesh: trimesh.Trimesh) -> Iterator[Int64Array]:
-    """Yield the vertices (N,) around each hole, in the order of the faces that fill it.
+def _holes(mesh: trimesh.Trimesh, single: Int64Array) -> Iterator[Int64Array]:
+    """Yield the edges (N,) around each hole, in the order of the faces that fill it, of the edges of ``single`` faces.
 
     Where holes touch at a vertex, the next edge around the vertex follows. A hole that touches itself contains the
     vertex twice. Outlines that do not return to their start, because faces differ in winding, are left out.
     """
-    outline = mesh.edges[group_rows(mesh.edges_sorted, require_count=1)][:, ::-1]
+    outline = np.asarray(mesh.edges)[single][:, ::-1]
+    vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     leaving: dict[int, list[int]] = defaultdict(list)
     for edge, start in enumerate(outline[:, 0].tolist()):
         leaving[start].append(edge)
@@ -52,21 +63,20 @@ def _holes(mesh: trimesh.Trimesh) -> Iterator[Int64Array]:
     for edge, (start, end) in enumerate(outline.tolist()):
         ways = leaving[end]
         if ways:
-            nearest = _angles(mesh, end, start, outline[ways, 1]).argmin() if len(ways) > 1 else 0
-            following[edge] = ways[int(nearest)]
+            spokes = vertices[[start, *outline[ways, 1]]] - vertices[end]
+            following[edge] = ways[int(_angles(spokes, normals[end]).argmin()) if len(ways) > 1 else 0]
     for first in list(following):
         edge, hole = first, []
         while edge in following:
             hole.append(edge)
             edge = following.pop(edge)
         if hole and edge == first:
-            yield outline[hole, 0]
+            yield single[hole]
 
 
-def _angles(mesh: trimesh.Trimesh, vertex: int, start: int, ends: Int64Array) -> Float64Array:
-    """Return the angles (N,) [rad] at a vertex from ``ends`` (N,) to ``start``, anticlockwise seen from outside."""
-    normal = mesh.vertex_normals[vertex]
-    one, others = mesh.vertices[start] - mesh.vertices[vertex], mesh.vertices[ends] - mesh.vertices[vertex]
+def _angles(spokes: Float64Array, normal: Float64Array) -> Float64Array:
+    """Return the angles (N,) [rad] about a normal from ``spokes[1:]`` to ``spokes[0]``, anticlockwise from outside."""
+    one, others = spokes[0], spokes[1:]
     angles = np.arctan2(np.cross(others, one) @ normal, others @ one - (others @ normal) * (one @ normal))
     return np.asarray(angles % (2 * np.pi))
 

@@ -89,6 +89,23 @@ def test_a_box_without_a_lid_stays_open(divisions: int) -> None:
     np.testing.assert_allclose(prepare_mesh(crate, "crate").area, crate.area)
 
 
+@pytest.mark.parametrize("small", ["crate", "cup", "leaf", "bent leaf", "triangle"])
+def test_small_open_bodies_beside_a_large_one_stay_open(small: str) -> None:
+    """The opening of the small body, or the whole sheet, is less than 0.5 % of the area of both."""
+    large = trimesh.creation.box((1, 1, 0.02))
+    if small in ("crate", "cup"):
+        body = trimesh.creation.box((0.04, 0.04, 0.04)) if small == "crate" else trimesh.creation.cylinder(0.02, 0.03)
+        body = without(body, body.face_normals[:, 2] > 0.5)
+    else:
+        body = trimesh.Trimesh([(0, 0, 0), (0.02, 0, 0), (0, 0.02, 0)], [(0, 1, 2)])
+        body = body if small == "triangle" else body.subdivide().subdivide()
+        body.vertices[:, 2] += (small == "bent leaf") * 10 * (body.vertices[:, 0] - 0.01) ** 2
+    both = trimesh.util.concatenate([large, body.apply_translation((0, 0, 0.2))])
+    assert close_holes(both) is both
+    lost = trimesh.util.concatenate([without(large, [3]), body])
+    assert close_holes(lost).area == pytest.approx(both.area)
+
+
 def test_a_closed_mesh_is_returned_unchanged() -> None:
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     assert close_holes(box) is box

@@ -115,10 +115,30 @@ def read_with_trimesh(path: Path, *, textures: bool = True) -> MeshFile:
 def _stated_normals(scene: trimesh.Scene) -> dict[str, Float64Array]:
     """Return the normals (V, 3) at the vertices of meshes whose file states them, by the names of the meshes.
 
-    The loaders of trimesh put them into the cache of a new mesh, which is empty otherwise.
+    The loaders of trimesh put them into the cache of a new mesh, which is empty otherwise. Those of PLY files with
+    texture coordinates remain in the order of the file there, although trimesh divides and reorders vertices.
     """
-    found = {name: mesh._cache["vertex_normals"] for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
+    found = {
+        name: _textured_ply_normals(mesh)
+        if "_ply_raw" in mesh.metadata and mesh.visual.kind == "texture"
+        else mesh._cache["vertex_normals"]
+        for name, mesh in scene.geometry.items()
+        if hasattr(mesh, "faces")
+    }
     return {name: np.array(values) for name, values in found.items() if values is not None}
+
+
+def _textured_ply_normals(mesh: trimesh.Trimesh) -> Float64Array | None:
+    """Return the normals (V, 3) of a PLY file at the vertices of a mesh with its triangles, or None without any."""
+    elements = mesh.metadata["_ply_raw"]
+    vertex, face = elements["vertex"]["data"], elements["face"]["data"]
+    if not {"nx", "ny", "nz"} <= set(elements["vertex"]["properties"]):
+        return None
+    (name,) = {"vertex_index", "vertex_indices"} & set(elements["face"]["properties"])
+    polygons = face[name] if isinstance(face, dict) else face[name]["f1"]
+    rows = np.zeros(len(mesh.vertices), dtype=np.int64)
+    rows[mesh.faces] = trimesh.geometry.triangulate_quads(polygons)
+    return np.column_stack([np.ravel(vertex[axis]) for axis in ("nx", "ny", "nz")]).astype(np.float64)[rows]
 
 
 def _decoded(material: Material) -> Material:

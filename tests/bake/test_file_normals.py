@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings, bake_asset
@@ -262,6 +263,31 @@ def test_colours_of_an_obj_file_are_read_with_its_normals(tmp_path: Path) -> Non
     expected = decode_srgb(part.mesh.triangles[..., 2] / RADIUS / 2 + 0.5)
     np.testing.assert_allclose(part.colours[..., 0], expected, atol=0.01)
     np.testing.assert_allclose(corner_normals(part.mesh), part.mesh.triangles / RADIUS, atol=1e-5)
+
+
+@pytest.mark.parametrize("corners", [3, 4])
+def test_normals_of_a_ply_file_with_seams_of_its_texture_are_read(corners: int, tmp_path: Path) -> None:
+    """Coordinates at the corners of faces divide vertices, as those of MeshLab do."""
+    mesh, normals = ball()
+    polygons = mesh.faces
+    if corners == 4:  # a sheet of 3 x 2 squares, as part of a cylinder about y
+        angle, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.6, 0.6, 4), [0, 0.02, 0.04]))
+        normals = np.stack([np.sin(angle), 0 * y, np.cos(angle)], axis=1)
+        mesh = trimesh.Trimesh(RADIUS * normals + np.outer(y, (0, 1, 0)), process=False)
+        polygons = np.array([(k, k + 1, k + 5, k + 4) for k in (0, 1, 2, 4, 5, 6)])
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    kinds = [("float", axis) for axis in ("x", "y", "z", "nx", "ny", "nz")]
+    lines = ["ply", "format ascii 1.0", "comment TextureFile a.png", f"element vertex {len(normals)}"]
+    lines += [f"property {kind} {name}" for kind, name in kinds] + [f"element face {len(polygons)}"]
+    lines += ["property list uchar int vertex_indices", "property list uchar float texcoord", "end_header"]
+    lines += [" ".join(map(str, row)) for row in np.hstack([mesh.vertices, normals])]
+    uv = np.random.default_rng(0).random((len(polygons), 2 * corners)).round(1)
+    lines += [" ".join(map(str, [corners, *f, 2 * corners, *t])) for f, t in zip(polygons, uv, strict=True)]
+    (tmp_path / "a.ply").write_text("\n".join(lines) + "\n")
+    (part,) = read_parts(tmp_path / "a.ply")
+    assert part.texture is not None
+    expected = part.mesh.triangles * ((1, 1, 1) if corners == 3 else (1, 0, 1)) / RADIUS
+    np.testing.assert_allclose(corner_normals(part.mesh), expected, atol=1e-5)
 
 
 def test_normals_of_a_proxy_file_must_be_unit_vectors(tmp_path: Path) -> None:

@@ -83,8 +83,8 @@ def normal_warnings(counts: Sequence[NormalCount]) -> Iterator[str]:
     stated, unusable, area, rounded = (sum(numbers) for numbers in zip(*counts, strict=True))
     if unusable:
         yield (
-            f"{unusable} of the {stated} normals of its face corners are zero, not finite, or on the back of their "
-            "face: these are computed from the faces"
+            f"{unusable} of the {stated} normals of its face corners are absent, zero, not finite, or on the back "
+            "of their face: these are computed from the faces"
         )
     if rounded > _MAX_ROUNDED * area:
         yield (

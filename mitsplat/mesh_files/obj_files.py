@@ -21,6 +21,10 @@ _KEPT = (b"map_", b"mtllib")
 _NAMES = (b"usemtl", b"newmtl", b"g", b"o")
 """Keys whose values may contain the character that begins a comment."""
 _PAINT = re.compile(rb"^\s*#MRGB\s+(?:[0-9a-fA-F]{8})+\s*$")
+_BARE_CORNER = re.compile(rb" (\d+)(?:/(\d*))?/?(?!\S)")
+_WITH_NORMAL = re.compile(rb"^f(?: \S+)* \d+/\d*/\d", re.M)
+_WITHOUT_NORMAL = re.compile(rb"^f(?: \S+)* \d+(?:/\d*)?/?(?!\S)", re.M)
+"""Lines of faces with a corner that has a normal, or none; and such a corner ``v``, ``v/t``, ``v/`` or ``v/t/``."""
 _COLOURED = re.compile(rb"^v(?: \S+){3}((?: \S+){3})$", re.M)
 _ODD_VERTEX = re.compile(rb"^v(?: \S+){5}$|^v(?: \S+){7,}$", re.M)
 _LEFT_OUT = {
@@ -41,6 +45,21 @@ def plain_text(content: bytes) -> bytes:
     lines = _CONTINUATION.sub(b" ", content.removeprefix(codecs.BOM_UTF8)).splitlines()
     painted = [line.split(maxsplit=1)[1].strip() for line in lines if _PAINT.match(line)]
     return b"\n".join(_painted_lines([_plain_line(line) for line in lines], b"".join(painted))) + b"\n"
+
+
+def with_all_normals(content: bytes) -> bytes:
+    """Return the plain text of an OBJ file whose corners either all have a normal, or none; absent ones are zero.
+
+    trimesh would read ``v/t`` after a face with ``v//n`` as ``v//n``, and drops the normals of other mixed faces.
+    """
+    if not (_WITH_NORMAL.search(content) and _WITHOUT_NORMAL.search(content)):
+        return content
+    zero = b"%d" % (len(re.findall(rb"^vn ", content, re.M)) + 1)
+
+    def fill(corner: re.Match[bytes]) -> bytes:
+        return b" %b/%b/%b" % (corner[1], corner[2] or b"", zero)
+
+    return re.sub(rb"^f .*$", lambda face: _BARE_CORNER.sub(fill, face[0]), content, flags=re.M) + b"vn 0 0 0\n"
 
 
 def _painted_lines(lines: list[bytes], colours: bytes) -> list[bytes]:

@@ -36,6 +36,7 @@ from mitsplat.mesh_files.obj_files import (
     obj_warnings,
     plain_text,
     values_of,
+    with_all_normals,
 )
 from mitsplat.mesh_files.trimesh_parts import scene_parts
 
@@ -154,10 +155,11 @@ def _plain_content(path: Path) -> bytes | None:
     if kind == ".obj":
         content = plain_obj(plain_text(path.read_bytes()))
         if re.search(rb"^mtllib ", content, re.M | re.I):
-            return content
+            return with_all_normals(content)
         # trimesh leaves out colours of vertices that have texture coordinates.
         without = [re.compile(pattern) for pattern in _COORDINATES]
-        return re.sub(rb"^f .*$", lambda face: without[1].sub(b"", without[0].sub(b"", face[0])), content, flags=re.M)
+        bare = re.sub(rb"^f .*$", lambda face: without[1].sub(b"", without[0].sub(b"", face[0])), content, flags=re.M)
+        return with_all_normals(bare)
     if kind == ".ply":
         header = _ply_header(path)
         for names in _COLOUR_NAMES:

@@ -190,8 +190,8 @@ def test_unusable_normals_are_computed_from_the_faces(tmp_path: Path) -> None:
     (part,) = model.parts
     count = int(np.isin(mesh.faces, (0, 1, 2)).sum())
     assert model.warnings == (
-        f"{count} of the 384 normals of its face corners are zero, not finite, or on the back of their face: these are "
-        "computed from the faces",
+        f"{count} of the 384 normals of its face corners are absent, zero, not finite, or on the back of their "
+        "face: these are computed from the faces",
     )
     found = corner_normals(part.mesh)
     computed = corner_normals(trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, process=False))
@@ -250,6 +250,31 @@ def test_cut_out_faces_keep_the_normals_of_their_places(tmp_path: Path) -> None:
     assert len(part.mesh.faces) > 200
     radial = part.mesh.triangles / np.linalg.norm(part.mesh.triangles, axis=2, keepdims=True)
     np.testing.assert_allclose(corner_normals(part.mesh), radial, atol=0.03)
+
+
+@pytest.mark.parametrize("material", [False, True])
+@pytest.mark.parametrize("bare", ["{v}", "{v}/{t}", "{v}/", "{v}/{t}/"])
+@pytest.mark.parametrize("full", ["{v}//{n}", "{v}/{t}/{n}"])
+@pytest.mark.parametrize("first", ["full", "bare"])
+def test_obj_faces_with_and_without_normals_in_one_file(
+    first: str, full: str, bare: str, material: bool, tmp_path: Path
+) -> None:
+    """Half of the sphere has exact normals, and the other half those of its faces."""
+    mesh, normals = ball()
+    lines = obj("{v}/{t}/{n}", material=material)(tmp_path / "a", mesh, normals).read_text().split("\n")
+    count, is_full = len(normals), (np.arange(128) < 64) == (first == "full")
+    faces = [
+        "f " + " ".join((full if has else bare).format(v=v + 1, t=v + 1, n=count - v) for v in face)
+        for face, has in zip(mesh.faces, is_full, strict=True)
+    ]
+    path = tmp_path / "a.obj"
+    path.write_text("\n".join([*(line for line in lines if not line.startswith("f ")), *faces]))
+    model = read_model(path)
+    (part,) = model.parts
+    computed = corner_normals(trimesh.Trimesh(part.mesh.vertices, part.mesh.faces, process=False))
+    expected = np.where(is_full[:, None, None], part.mesh.triangles / RADIUS, computed)
+    np.testing.assert_allclose(corner_normals(part.mesh), expected, atol=1e-5)
+    assert any(one.startswith("192 of the 384 normals of its face corners are absent") for one in model.warnings)
 
 
 def test_colours_of_an_obj_file_are_read_with_its_normals(tmp_path: Path) -> None:

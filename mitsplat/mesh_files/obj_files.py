@@ -22,9 +22,7 @@ _NAMES = (b"usemtl", b"newmtl", b"g", b"o")
 """Keys whose values may contain the character that begins a comment."""
 _PAINT = re.compile(rb"^\s*#MRGB\s+(?:[0-9a-fA-F]{8})+\s*$")
 _BARE_CORNER = re.compile(rb" (\d+)(?:/(\d*))?/?(?!\S)")
-_WITH_NORMAL = re.compile(rb"^f(?: \S+)* \d+/\d*/\d", re.M)
-_WITHOUT_NORMAL = re.compile(rb"^f(?: \S+)* \d+(?:/\d*)?/?(?!\S)", re.M)
-"""Lines of faces with a corner that has a normal, or none; and such a corner ``v``, ``v/t``, ``v/`` or ``v/t/``."""
+"""Corner of a face without a normal: ``v``, ``v/t``, ``v/`` or ``v/t/``."""
 _COLOURED = re.compile(rb"^v(?: \S+){3}((?: \S+){3})$", re.M)
 _ODD_VERTEX = re.compile(rb"^v(?: \S+){5}$|^v(?: \S+){7,}$", re.M)
 _LEFT_OUT = {
@@ -47,12 +45,18 @@ def plain_text(content: bytes) -> bytes:
     return b"\n".join(_painted_lines([_plain_line(line) for line in lines], b"".join(painted))) + b"\n"
 
 
+def face_corners(content: bytes) -> bytes:
+    """Return the corners of all faces of the plain text of an OBJ file, each after a blank."""
+    return b"".join(re.findall(rb"^f( .*)$", content, re.M))
+
+
 def with_all_normals(content: bytes) -> bytes:
     """Return the plain text of an OBJ file whose corners either all have a normal, or none; absent ones are zero.
 
     trimesh would read ``v/t`` after a face with ``v//n`` as ``v//n``, and drops the normals of other mixed faces.
     """
-    if not (_WITH_NORMAL.search(content) and _WITHOUT_NORMAL.search(content)):
+    faces = face_corners(content)
+    if len(re.findall(rb"/\d*/\d", faces)) in (0, faces.count(b" ")):
         return content
     zero = b"%d" % (len(re.findall(rb"^vn ", content, re.M)) + 1)
 

@@ -32,6 +32,7 @@ from mitsplat.mesh_files.mesh_file import MAX_FRACTION, PAINTED_MATERIAL, UNKNOW
 from mitsplat.mesh_files.obj_files import (
     check_obj_materials,
     check_texture,
+    face_corners,
     obj_fault,
     obj_warnings,
     plain_text,
@@ -154,7 +155,8 @@ def _plain_content(path: Path) -> bytes | None:
         return _plain_stl(path)
     if kind == ".obj":
         content = plain_obj(plain_text(path.read_bytes()))
-        if re.search(rb"^mtllib ", content, re.M | re.I):
+        faces = face_corners(content)
+        if re.search(rb"^mtllib ", content, re.M | re.I) or faces.count(b"/") == 2 * faces.count(b"//"):
             return with_all_normals(content)
         # trimesh leaves out colours of vertices that have texture coordinates.
         without = [re.compile(pattern) for pattern in _COORDINATES]

@@ -30,6 +30,8 @@ _INSET = 2e-3
 """Distance of sampled points from the corners of a proxy's faces, as a share of the way to the centre of the face."""
 _ALIKE = 0.5
 """Minimum cosine between a face of a proxy and the face of the mesh that gives it normals."""
+_LIFT = 1e-5
+"""Distance by which faces are raised to tell the two faces of a sheet at one place apart, relative to the size."""
 _EQUAL = np.cos(np.radians(1.0))
 """Cosine between stated and computed normals above which a proxy states none."""
 
@@ -102,14 +104,22 @@ def with_normals(proxy: trimesh.Trimesh, meshes: Sequence[trimesh.Trimesh]) -> t
     stated = np.concatenate(
         [np.full((len(m.faces), 3, 3), np.nan) if n is None else n for m, n in zip(meshes, found, strict=True)]
     )
-    places = proxy.triangles + _INSET * (proxy.triangles_center[:, None] - proxy.triangles)
-    faces, barycentric = nearest_faces(source, places.reshape(-1, 3))
-    normals = np.einsum("nk,nkd->nd", barycentric, stated[faces]).reshape(-1, 3, 3)
-    length = np.linalg.norm(normals, axis=2, keepdims=True)
-    own, facing = smooth_normals(proxy), proxy.face_normals[:, None]
-    alike = (source.face_normals[faces].reshape(-1, 3, 3) * facing).sum(axis=2) > _ALIKE
-    alike &= (length[..., 0] > 1e-3) & ((normals * facing).sum(axis=2) > 0)  # False for NaN
-    normals = np.where(alike[..., None], normals / np.maximum(length, 1e-3), own)
+    places = (proxy.triangles + _INSET * (proxy.triangles_center[:, None] - proxy.triangles)).reshape(-1, 3)
+    facing = np.repeat(proxy.face_normals, 3, axis=0)
+    faces, barycentric = nearest_faces(source, places)
+    alike = (source.face_normals[faces] * facing).sum(axis=1) > _ALIKE
+    if not alike.all():
+        lift = _LIFT * source.scale
+        raised = source.triangles + lift * source.face_normals[:, None]
+        raised = trimesh.Trimesh(raised.reshape(-1, 3), np.arange(raised.size // 3).reshape(-1, 3), process=False)
+        back = np.flatnonzero(~alike)
+        faces[back], barycentric[back] = nearest_faces(raised, places[back] + 2 * lift * facing[back])
+        alike[back] = (source.face_normals[faces[back]] * facing[back]).sum(axis=1) > _ALIKE
+    normals = np.einsum("nk,nkd->nd", barycentric, stated[faces])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    alike &= (length[:, 0] > 1e-3) & ((normals * facing).sum(axis=1) > 0)  # False for NaN
+    own = smooth_normals(proxy)
+    normals = np.where(alike[:, None], normals / np.maximum(length, 1e-3), own.reshape(-1, 3)).reshape(-1, 3, 3)
     if ((normals * own).sum(axis=2) > _EQUAL).all():
         return proxy
     made = proxy.copy()

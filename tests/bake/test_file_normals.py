@@ -222,6 +222,25 @@ def test_normals_that_round_a_box_are_used_and_named(tmp_path: Path) -> None:
     assert "its normals round the edges of 100% of its area" in warning
 
 
+def test_the_two_faces_of_a_sheet_at_one_place_keep_their_normals(tmp_path: Path) -> None:
+    """A part of a cylinder about z has each face twice, in both windings, as sheets of many game models do."""
+    angle, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.6, 0.6, 4), [0, 0.02, 0.04]))
+    normals = np.stack([np.cos(angle), np.sin(angle), 0 * z], axis=1)
+    corners = np.array([(k, k + 1, k + 5, k + 4) for k in (0, 1, 2, 4, 5, 6)])
+    front = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+    back = np.concatenate([corners[:, [1, 0, 3]], corners[:, [1, 3, 2]]])  # with the other diagonals
+    sheet = trimesh.Trimesh(
+        np.tile(RADIUS * normals + np.outer(z, (0, 0, 1)), (2, 1)), np.concatenate([front, back + 12]), process=False
+    )
+    path = ply(tmp_path / "a", sheet, np.concatenate([normals, -normals]))
+    mesh = bake_asset(path, name="a", kind="environment", settings=QUICK).asset.mesh
+    assert mesh is not None
+    assert len(mesh.faces) == 24
+    radial = mesh.triangles * (1, 1, 0) / RADIUS
+    radial *= np.sign((radial.mean(axis=1) * mesh.face_normals).sum(axis=1))[:, None, None]
+    np.testing.assert_allclose(smooth_normals(mesh), radial, atol=0.01)
+
+
 def test_normals_of_a_skinned_part_turn_with_its_joints(tmp_path: Path) -> None:
     """A joint that turns by 90 degrees about x and doubles x maps the ellipsoid (2, 1, 1) and its normals."""
     mesh, normals = ball()

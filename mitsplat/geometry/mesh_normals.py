@@ -116,9 +116,11 @@ def read_stated_normals(mesh: trimesh.Trimesh) -> None:
         ValueError: If they are not finite vectors of length 1 for all corners.
     """
     face = mesh.metadata.get("_ply_raw", {}).get("face", {}).get("data")
-    if _STATED not in (getattr(getattr(face, "dtype", None), "names", None) or ()):
+    names = face if isinstance(face, dict) else getattr(getattr(face, "dtype", None), "names", None) or ()
+    if _STATED not in names:
         return
-    local = np.asarray(face[_STATED]["f1"], dtype=np.float32)
+    stored = np.asarray(face[_STATED])  # of text files, or a record of each list
+    local = np.asarray(stored["f1"] if stored.dtype.names else stored, dtype=np.float32)
     if local.shape != (len(mesh.faces), 9) or not np.allclose((local.reshape(-1, 3) ** 2).sum(axis=1), 1, atol=1e-2):
         raise ValueError(f"{_STATED} must be three vectors of length 1 for each face")
     mesh.face_attributes[_STATED] = local

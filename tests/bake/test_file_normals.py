@@ -343,6 +343,28 @@ def test_normals_of_a_proxy_file_must_be_unit_vectors(tmp_path: Path) -> None:
         Asset.load(tmp_path / "asset")
 
 
+def test_normals_of_a_proxy_file_are_read_from_text_too(tmp_path: Path) -> None:
+    asset = bake_asset(glb(tmp_path / "ball", *ball()), name="ball", settings=QUICK).asset
+    asset.save(tmp_path / "asset")
+    assert asset.mesh is not None
+    asset.mesh.export(tmp_path / "asset/mesh.ply", encoding="ascii")
+    mesh = Asset.load(tmp_path / "asset").mesh
+    assert mesh is not None
+    np.testing.assert_allclose(smooth_normals(mesh), smooth_normals(asset.mesh), atol=1e-4)
+
+
+def test_normals_of_a_proxy_file_must_be_lists(tmp_path: Path) -> None:
+    bake_asset(glb(tmp_path / "ball", *ball()), name="ball", settings=QUICK).asset.save(tmp_path / "asset")
+    faces = np.zeros(1, [("count", "u1"), ("corners", "<i4", 3), ("corner_normals", "<f4")])
+    faces["count"], faces["corners"] = 3, (0, 1, 2)
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "element face 1\n"
+    head += "property list uchar int vertex_indices\nproperty float corner_normals\nend_header\n"
+    (tmp_path / "asset/mesh.ply").write_bytes(head.encode() + np.eye(3, dtype="<f4").tobytes() + faces.tobytes())
+    with pytest.raises(InputError, match=r"mesh\.ply: corner_normals must be three vectors"):
+        Asset.load(tmp_path / "asset")
+
+
 def test_files_without_normals_and_meshes_in_memory_have_computed_normals(tmp_path: Path) -> None:
     mesh, normals = ball()
     mesh.export(tmp_path / "a.stl")

@@ -39,6 +39,7 @@ MODULES = (
     "geometry.hull_fit",
     "geometry.mesh",
     "geometry.mesh_distance",
+    "geometry.mesh_holes",
     "geometry.rigid",
     *(f"physics.{name}" for name in _PHYSICS_MODULES),
     "scene.planning.contents",

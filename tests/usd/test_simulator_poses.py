@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -120,6 +121,7 @@ def test_steps_of_a_simulation_compile_no_kernels(scene: ms.Scene, model: mujoco
     """The first three frames compile: kernels depend on the emitters and shapes that exist, and at first their number
     changes, because those of the previous frame are freed during the next one.
     """
+    gc.collect()  # those of earlier tests
     with ms.Renderer(scene) as renderer, dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         for step in range(6):
             dr.kernel_history_clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -240,8 +241,10 @@ def test_the_file_is_reloaded_and_an_invalid_one_keeps_the_last_scene(shown):
 
 
 def test_another_view_compiles_no_new_kernels(shown):
+    """Materials of earlier tests are freed first, because kernels cover all kinds of materials that exist."""
     import drjit as dr
 
+    gc.collect()
     scene = shown.scene_page._scene
     renders = SceneRenders(lambda text: None)
     views = [ViewRequest(scene, 0, look_at_pose((x, 0.3, 0.5), (0, 0, 0)), width=320) for x in (0.1, 0.2, -0.3)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -37,23 +38,13 @@ class DistanceSurface:
     @quiet_warp()
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.points = contact_points(mesh)
-        self._mesh = wp.Mesh(
-            points=wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device="cpu"),
-            indices=wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device="cpu"),
-            support_winding_number=True,
-        )
+        self._mesh = _warp_mesh(mesh, winding_number=True)
 
     @quiet_warp()
     def signed_distances(self, points: Float64Array) -> Float32Array:
         """Return the distance of each point (N, 3) [m], in the mesh's frame, to the surface; negative inside."""
         distances = wp.empty(len(points), dtype=wp.float32, device="cpu")
-        wp.launch(
-            _signed_distances,
-            dim=len(points),
-            inputs=[self._mesh.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), _FAR],
-            outputs=[distances],
-            device="cpu",
-        )
+        _query(_signed_distances, self._mesh, points, [distances])
         found: Float32Array = np.array(distances.numpy())
         return found
 
@@ -61,13 +52,7 @@ class DistanceSurface:
     def nearest(self, points: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:
         """Return the surface points (N, 3) nearest to ``points`` (N, 3), unit normals (N, 3) and distances (N,)."""
         positions, normals = (wp.empty(len(points), dtype=wp.vec3, device="cpu") for _ in range(2))
-        wp.launch(
-            _nearest_points,
-            dim=len(points),
-            inputs=[self._mesh.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), _FAR],
-            outputs=[positions, normals],
-            device="cpu",
-        )
+        _query(_nearest_points, self._mesh, points, [positions, normals])
         found = positions.numpy().astype(np.float64)
         return found, normals.numpy().astype(np.float64), np.linalg.norm(found - points, axis=1)
 
@@ -75,20 +60,24 @@ class DistanceSurface:
 @quiet_warp()
 def nearest_faces(mesh: trimesh.Trimesh, points: Float64Array) -> tuple[Int64Array, Float64Array]:
     """Return the nearest faces (N,) of a mesh to ``points`` (N, 3), and barycentric coordinates (N, 3) on them."""
-    surface = wp.Mesh(
-        points=wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device="cpu"),
-        indices=wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device="cpu"),
-    )
     faces = wp.zeros(len(points), dtype=wp.int32, device="cpu")
     weights = wp.zeros(len(points), dtype=wp.vec3, device="cpu")
-    wp.launch(
-        _nearest_faces,
-        dim=len(points),
-        inputs=[surface.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), _FAR],
-        outputs=[faces, weights],
-        device="cpu",
-    )
+    _query(_nearest_faces, _warp_mesh(mesh), points, [faces, weights])
     return faces.numpy().astype(np.int64), weights.numpy().astype(np.float64)
+
+
+def _warp_mesh(mesh: trimesh.Trimesh, *, winding_number: bool = False) -> wp.Mesh:
+    return wp.Mesh(
+        points=wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device="cpu"),
+        indices=wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device="cpu"),
+        support_winding_number=winding_number,
+    )
+
+
+def _query(kernel: wp.Kernel, mesh: wp.Mesh, points: Float64Array, outputs: list[wp.array[Any]]) -> None:
+    """Run a kernel that queries a mesh at points (N, 3)."""
+    inputs = [mesh.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), _FAR]
+    wp.launch(kernel, dim=len(points), inputs=inputs, outputs=outputs, device="cpu")
 
 
 class PlacedSurface:

@@ -35,8 +35,9 @@ def check_lamps(scene: Scene) -> Iterator[Finding]:
     """
     ensure_variant()
     environment = scene.environment_of(0)
-    surroundings = None if environment is None or environment.mesh is None else plain_mesh(environment.mesh)
-    captured = None if surroundings is None else ray_scene({"environment": surroundings})
+    captured = None
+    if environment is not None and environment.mesh is not None:
+        captured = ray_scene({"environment": plain_mesh(environment.mesh)})
     meshes = [
         mesh
         for shape, mesh in zip(scene.spec.shapes, scene.shape_meshes, strict=True)
@@ -48,7 +49,7 @@ def check_lamps(scene: Scene) -> Iterator[Finding]:
         if not lamps:
             continue
         ends = np.array([lamp.position for lamp in lamps])
-        hidden = float(_blocked(captured, reference_point(scene), ends).mean()) if captured is not None else 0.0
+        hidden = float(_blocked(captured, reference_point(scene), ends).mean())
         if hidden > MAX_HIDDEN:
             text = f"lights[{number}]: the environment hides {hidden:.0%} of these lamps from the objects"
             remedy = "limit draw.azimuth or draw.position to the sides without walls"
@@ -65,7 +66,7 @@ def check_lamps(scene: Scene) -> Iterator[Finding]:
         dark = [
             not enclosing_shape(scene, end) and bool(_blocked(shapes, end, places).all())
             for end, places in zip(ends, towards, strict=True)
-            if shapes is not None and len(places)
+            if len(places)
         ]
         if dark and (hidden := float(np.mean(dark))) > MAX_HIDDEN:
             which = "this lamp" if len(lamps) == 1 else f"{hidden:.0%} of these lamps"
@@ -95,8 +96,10 @@ def _lit_places(scene: Scene, lamp: LocalLight) -> Float64Array:
     return np.asarray(places[cosines > least])
 
 
-def _blocked(surfaces: mi.Scene, start: Sequence[float] | Float64Array, ends: Float64Array) -> BoolArray:
-    """Return True for ends (N, 3) [m] that a surface hides from the start [m]."""
+def _blocked(surfaces: mi.Scene | None, start: Sequence[float] | Float64Array, ends: Float64Array) -> BoolArray:
+    """Return True for ends (N, 3) [m] that a surface, if there is one, hides from the start [m]."""
+    if surfaces is None:
+        return np.zeros(len(ends), dtype=bool)
     blocked = np.array(surfaces.ray_test(segments(np.broadcast_to(start, ends.shape), ends)), dtype=bool)
     check_dropped_rays()
     return np.broadcast_to(blocked, len(ends))

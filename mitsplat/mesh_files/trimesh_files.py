@@ -51,8 +51,10 @@ _STL_FACE_BYTES = 50
 _NO_MATERIALS = (UNKNOWN_MATERIAL, PAINTED_MATERIAL)
 _COLOUR_NAMES = (("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of colours in PLY files that trimesh does not read."""
-_COORDINATES = (rb"(?<=/)[^/\s]+(?=/)", rb"(?<!/)/[^/\s]*(?!\S)|/+(?!\S)")
-"""Texture coordinates ``t`` of the corners ``v/t/n`` of OBJ faces, and the ends ``/t``, ``/`` and ``//`` of others."""
+_MIDDLE = re.compile(rb"(?<=/)[^/\s]+(?=/)")
+"""Texture coordinate ``t`` of a corner ``v/t/n`` of an OBJ face."""
+_END = re.compile(rb"(?<!/)/[^/\s]*(?!\S)|/+(?!\S)")
+"""End ``/t``, ``/`` or ``//`` of a corner without a normal."""
 _LENGTH = (
     "its data do not have the length that its header states: it is incomplete, or its faces have different numbers of "
     "corners, which is not read from binary PLY files: export it with triangles"
@@ -156,11 +158,11 @@ def _plain_content(path: Path) -> bytes | None:
     if kind == ".obj":
         content = plain_obj(plain_text(path.read_bytes()))
         faces = face_corners(content)
-        if re.search(rb"^mtllib ", content, re.M | re.I) or faces.count(b"/") == 2 * faces.count(b"//"):
+        has_coordinates = faces.count(b"/") > 2 * faces.count(b"//")  # not only corners v and v//n
+        if re.search(rb"^mtllib ", content, re.M | re.I) or not has_coordinates:
             return with_all_normals(content)
         # trimesh leaves out colours of vertices that have texture coordinates.
-        without = [re.compile(pattern) for pattern in _COORDINATES]
-        bare = re.sub(rb"^f .*$", lambda face: without[1].sub(b"", without[0].sub(b"", face[0])), content, flags=re.M)
+        bare = re.sub(rb"^f .*$", lambda face: _END.sub(b"", _MIDDLE.sub(b"", face[0])), content, flags=re.M)
         return with_all_normals(bare)
     if kind == ".ply":
         header = _ply_header(path)

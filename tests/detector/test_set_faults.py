@@ -163,3 +163,28 @@ def test_faults_of_a_coco_file_are_one_sentence(
 def test_images_are_found_in_the_unicode_form_of_macos(tmp_path: Path) -> None:
     image = {"id": 1, "file_name": unicodedata.normalize("NFD", f"{NAME}.png")}
     assert len(read_set(coco(tmp_path, {}, images=[image]), "train").samples) == 1
+
+
+@pytest.mark.parametrize("side", [(0, -1), (1, -1), (0, 1), (1, 1)], ids=["left", "top", "right", "bottom"])
+@pytest.mark.parametrize(
+    ("length", "beyond", "is_refused"),
+    [(40, 9, False), (40, 11, True), (32, 8, False), (4, 2, False), (4, 3, True), (40, 3, False)],
+)
+def test_a_mask_may_leave_its_box_by_two_pixels_or_a_quarter_of_its_side(
+    tmp_path: Path, side: tuple[int, int], length: int, beyond: int, is_refused: bool
+) -> None:
+    """The mask is the box, extended on one side. The other side of the box has another length."""
+    axis, sign = side
+    low, size = np.array([20, 20]), np.full(2, 36)
+    size[axis] = length
+    start, end = low.copy(), low + size
+    (start if sign < 0 else end)[axis] += sign * beyond
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[start[1] : end[1], start[0] : end[0]] = 1
+    root = coco(tmp_path, {"bbox": [*low.tolist(), *size.tolist()], "segmentation": run_lengths(mask, "F")})
+    if is_refused:
+        with pytest.raises(InputError, match="bbox must enclose its segmentation"):
+            read_set(root, "train")
+    else:
+        (instance,) = read_set(root, "train").samples[0].instances
+        assert instance.box == (*low, *(low + size))

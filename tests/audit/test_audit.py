@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from pycocotools import mask as coco_mask
 
-from mitsplat.audit.audit import CrossFrameCheck, audit_dataset
+from mitsplat.audit.audit import POLYGON_AREA, POLYGON_IOU, CrossFrameCheck, audit_dataset
 from mitsplat.errors import InputError
 from mitsplat.storage.files import Record
 from tests.cli.typed import run
@@ -40,6 +40,25 @@ def test_a_clean_dataset_has_no_violations(clean: Path, capsys: pytest.CaptureFi
     assert found.frames == 6 and found.instances > 10
     assert run("audit", clean) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "violations: 0"
+
+
+def test_counts_of_the_audit_are_those_of_the_manifest(dataset: Path) -> None:
+    """Totals are compared with sums over the manifest, after values were changed that the clean dataset lacks."""
+    records = records_of(dataset)
+    labels = [label for record in records for label in record["labels"]["instances"]]
+    for number, label in enumerate(labels):
+        label |= {"polygon_iou": 0.5 if number % 3 else 1.0, "marks": ["occluded", "disagreeing"][: number % 3]}
+    records[0]["labels"]["dropped"]["hidden"], records[1]["labels"]["dropped"]["hidden"] = 2, 3
+    store(dataset, records)
+    found = audit_dataset(dataset)
+    low = [label["area"] > POLYGON_AREA and label["polygon_iou"] < POLYGON_IOU for label in labels]
+    assert found.low_polygons == sum(low) != sum(label["area"] <= POLYGON_AREA for label in labels)
+    assert (found.frames, found.instances) == (len(records), len(labels))
+    assert found.files == sum(len(record["files"]) for record in records)
+    marks = [label["marks"] for label in labels]
+    assert found.marked == {mark: sum(mark in of for of in marks) for mark in ("occluded", "disagreeing")}
+    assert found.dropped["hidden"] == 5
+    assert found.dropped["fragments"] == sum(record["labels"]["dropped"]["fragments"] for record in records)
 
 
 def lose_a_label(root: Path, records: list[Record]) -> None:
@@ -86,6 +105,14 @@ def deny_truncation(root: Path, records: list[Record]) -> None:
 
 def scale_a_pose(root: Path, records: list[Record]) -> None:
     first(records)["world_from_object"][0][0] = 1.5
+
+
+def halve_measured_depths(root: Path, records: list[Record]) -> None:
+    """Halve the depths of a sensor that misses the upper half of the image."""
+    path = root / "depth-sensor/train/000000.png"
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 2
+    picture[: len(picture) // 2] = 0
+    cv2.imwrite(str(path), picture)
 
 
 def merge_ids(root: Path, records: list[Record]) -> None:
@@ -173,6 +200,124 @@ def claim_a_polygon(root: Path, records: list[Record]) -> None:
     first(records)["polygon_iou"] = 0.5
 
 
+def claim_an_area(root: Path, records: list[Record]) -> None:
+    first(records)["area"] += 1
+
+
+def claim_a_full_area(root: Path, records: list[Record]) -> None:
+    first(records)["amodal_area"] += 1
+
+
+def shrink_a_silhouette(root: Path, records: list[Record]) -> None:
+    """Remove the lowest row of an unoccluded instance from its silhouette only."""
+    label = first(records)
+    mask = decode(records, label, "amodal_rle")
+    _, y0, _, y1 = label["amodal_box"]
+    mask[y1 - 1] = 0
+    columns = np.flatnonzero(mask.any(axis=0)).tolist()
+    label["amodal_box"] = [columns[0], y0, columns[-1] + 1, y1 - 1]
+    label |= {"amodal_rle": encode(mask), "amodal_area": int(mask.sum())}
+
+
+def widen_a_silhouette(root: Path, records: list[Record]) -> None:
+    first(records)["silhouette_box"][2] += 1
+
+
+def repeat_an_id(root: Path, records: list[Record]) -> None:
+    records[0]["labels"]["instances"][1]["id"] = 1
+
+
+def rename_a_class(root: Path, records: list[Record]) -> None:
+    label = first(records)
+    label["class"] = {"nut": "bolt", "bolt": "nut"}[label["class"]]
+
+
+def add_a_mark(root: Path, records: list[Record]) -> None:
+    first(records)["marks"] = ["occluded"]
+
+
+def change_rules(root: Path, **rules: float) -> None:
+    content = json.loads((root / "dataset.json").read_text())
+    content["scene"]["labels"] |= rules
+    (root / "dataset.json").write_text(json.dumps(content))
+
+
+def omit_an_occlusion_mark(root: Path, records: list[Record]) -> None:
+    change_rules(root, min_visible=0.99)
+
+
+def omit_a_disagreement_mark(root: Path, records: list[Record]) -> None:
+    change_rules(root, min_agreement=0.9)
+    first(records)["agreement"] = 0.89
+
+
+def keep_small_instances(root: Path, records: list[Record]) -> None:
+    change_rules(root, min_pixels=first(records)["area"] + 1)
+
+
+def change_layout(root: Path, change: Callable[[list[Any]], object]) -> None:
+    path = root / "layouts/0000.json"
+    layout = json.loads(path.read_text())
+    change(layout["instances"])
+    path.write_text(json.dumps(layout))
+
+
+def swap_an_asset_of_the_layout(root: Path, records: list[Record]) -> None:
+    change_layout(root, lambda instances: instances[0].update(asset=1 - instances[0]["asset"]))
+
+
+def add_to_the_layout(root: Path, records: list[Record]) -> None:
+    change_layout(root, lambda instances: instances.append(instances[0] | {"id": 99}))
+
+
+def remove_from_the_layout(root: Path, records: list[Record]) -> None:
+    change_layout(root, lambda instances: instances.pop(0))
+
+
+def drop_a_category(root: Path, records: list[Record]) -> None:
+    path = root / "annotations/instances_train.json"
+    content = json.loads(path.read_text())
+    content["categories"].pop()
+    path.write_text(json.dumps(content))
+
+
+def invert_cameras(root: Path, records: list[Record]) -> None:
+    for record in records:
+        camera = record["camera"]
+        camera["world_from_camera"] = np.linalg.inv(camera["world_from_camera"]).tolist()
+
+
+def replace_first_line(path: Path, values: list[float]) -> None:
+    head, *rest = path.read_text().splitlines()
+    path.write_text("\n".join([" ".join([head.split()[0], *map(str, values)]), *rest]) + "\n")
+
+
+def write_two_vertices(root: Path, records: list[Record]) -> None:
+    replace_first_line(root / "labels/train/000000.txt", [0.1, 0.1, 0.2, 0.2])
+
+
+def write_half_a_vertex(root: Path, records: list[Record]) -> None:
+    replace_first_line(root / "labels/train/000000.txt", [0.1, 0.1, 0.2, 0.2, 0.1, 0.2, 0.3])
+
+
+def leave_the_image(root: Path, records: list[Record]) -> None:
+    replace_first_line(root / "labels/train/000000.txt", [0.1, 0.1, 1.01, 0.2, 0.1, 0.2])
+
+
+def write_three_corners(root: Path, records: list[Record]) -> None:
+    replace_first_line(root / "yolo-obb/labels/train/000000.txt", [0.1, 0.1, 0.2, 0.1, 0.2, 0.2])
+
+
+def train_on_the_other_split(root: Path, records: list[Record]) -> None:
+    path = root / "data.yaml"
+    path.write_text(path.read_text().replace("train: images/train", "train: images/val"))
+
+
+def swap_keypoint_names(root: Path, records: list[Record]) -> None:
+    path = root / "yolo-pose/data.yaml"
+    path.write_text(path.read_text().replace('"top"', '"bottom"', 1))
+
+
 def model_in_metres(root: Path, records: list[Record]) -> None:
     path = root / "bop/models/obj_000001.ply"
     mesh = trimesh.load_mesh(path)
@@ -189,6 +334,7 @@ FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
     claim_visibility: ("manifest.jsonl, frame 0", "its visible fraction is"),
     deny_truncation: ("manifest.jsonl, frame 0", "its truncation is"),
     scale_a_pose: ("manifest.jsonl, frame 0", "its pose is not a rotation"),
+    halve_measured_depths: ("depth-sensor/train/000000.png", "depths have a median error of"),
     merge_ids: ("instances/train/000000.png", "pixels differ from the masks"),
     resize_an_image: ("images/train/000000.png", "is 32x24 px"),
     repeat_an_image: ("images/train/000001.png", "is the same picture as"),
@@ -208,6 +354,27 @@ FAULTS: dict[Callable[[Path, list[Record]], None], tuple[str, str]] = {
         "does not list bop/train/000000/mask/000000_000000.png of the format bop",
     ),
     claim_a_polygon: ("labels/train/000000.txt", "the IoU of its polygon is"),
+    claim_an_area: ("manifest.jsonl, frame 0", "do not match its mask"),
+    claim_a_full_area: ("manifest.jsonl, frame 0", "do not match its mask"),
+    shrink_a_silhouette: ("manifest.jsonl, frame 0", "pixels outside its silhouette"),
+    widen_a_silhouette: ("manifest.jsonl, frame 0", "does not match its silhouette"),
+    repeat_an_id: ("manifest.jsonl, frame 0", "instance 1 is labelled 2 times"),
+    rename_a_class: ("manifest.jsonl, frame 0", "instance 1: class 1 is not 'bolt'"),
+    add_a_mark: ("manifest.jsonl, frame 0", "its marks ['occluded'] do not match the thresholds"),
+    omit_an_occlusion_mark: ("manifest.jsonl, frame 0", "instance 3: its marks [] do not match the thresholds"),
+    omit_a_disagreement_mark: ("manifest.jsonl, frame 0", "instance 1: its marks [] do not match the thresholds"),
+    keep_small_instances: ("manifest.jsonl, frame 0", "instance 1: has 104 pixels, fewer than 105"),
+    swap_an_asset_of_the_layout: ("manifest.jsonl, frame 1", "instance 1 is of another asset or class than in layouts"),
+    add_to_the_layout: ("manifest.jsonl, frame 1", "4 labels and 0 unlabelled instances are not all of layouts"),
+    remove_from_the_layout: ("manifest.jsonl, frame 1", "instance 1 is not in layouts/0000.json"),
+    drop_a_category: ("annotations/instances_train.json", "categories: there are 1, not 2"),
+    invert_cameras: ("manifest.jsonl", "times their size away from its poses"),
+    write_two_vertices: ("labels/train/000000.txt", "must have three or more vertices (got 4 numbers)"),
+    write_half_a_vertex: ("labels/train/000000.txt", "must have three or more vertices (got 7 numbers)"),
+    leave_the_image: ("labels/train/000000.txt", "its polygon leaves the image"),
+    write_three_corners: ("yolo-obb/labels/train/000000.txt", "its line is not four corners"),
+    train_on_the_other_split: ("data.yaml", "train is images/val, not images/train"),
+    swap_keypoint_names: ("yolo-pose/data.yaml", "its keypoints are not"),
     model_in_metres: ("bop/models/models_info.json", "does not state the measures of bop/models/obj_000001.ply"),
 }
 

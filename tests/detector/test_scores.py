@@ -43,21 +43,22 @@ def test_average_precision_equals_a_case_computed_by_hand() -> None:
     2/3.
     Of the 101 recalls, 0 to 0.33 (34) have precision 1, 0.34 to 0.66 (33) have 2/3, and the rest have 0.
 
-    Class b has one box with an IoU of 0.6. It counts at the thresholds 0.5, 0.55 and 0.6.
+    Class b has one box with an IoU of 16/30. It counts at the threshold 0.5 alone.
     """
     detections = [
         found(1, 1, [0, 0, 10, 10], 0.9),
         found(2, 1, [40, 40, 10, 10], 0.8),
         found(2, 1, [0, 0, 10, 10], 0.7),
-        found(3, 2, [10, 10, 30, 18], 0.5),
+        found(3, 2, [10, 10, 30, 16], 0.5),
     ]
     score = DetectionMatches(TRUE, detections).average_precision()
     a = (34 + 33 * 2 / 3) / 101
     assert score.classes["a"] == pytest.approx((a, a), abs=1e-9)
-    assert score.classes["b"] == pytest.approx((0.3, 1.0), abs=1e-9)
+    assert score.classes["b"] == pytest.approx((0.1, 1.0), abs=1e-9)
     assert score.map50 == pytest.approx((a + 1) / 2, abs=1e-9)
-    assert score.map50_95 == pytest.approx((a + 0.3) / 2, abs=1e-9)
+    assert score.map50_95 == pytest.approx((a + 0.1) / 2, abs=1e-9)
     assert score.curves["a"][[0, 33, 34, 66, 67]] == pytest.approx([1, 1, 2 / 3, 2 / 3, 0], abs=1e-9)
+    assert score.curves["b"] == pytest.approx(np.ones(101), abs=1e-9)
 
 
 def test_perfect_detections_score_one_and_none_score_zero() -> None:

@@ -11,7 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from mitsplat.cli import app
-from mitsplat.detector.likeness import BRIGHTNESS, Likeness, Trait, _trait, compare_with_photographs
+from mitsplat.detector.labelled_sets.labelled_set import LabelledObject, Sample
+from mitsplat.detector.likeness import BRIGHTNESS, Likeness, Trait, _object_pixels, _trait, compare_with_photographs
 from mitsplat.errors import InputError
 from tests.detector.painted import HEIGHT, HUES, WIDTH, write_coco, write_yolo, yolo_text
 
@@ -136,6 +137,16 @@ def test_all_forms_of_labels_give_the_same_traits(rendered: Path, tmp_path: Path
     ]
     for other in found[1:]:
         assert other.classes == found[0].classes
+
+
+@pytest.mark.parametrize("scale", [0.5, 1, 3])
+def test_colours_in_boxes_are_those_of_their_middle_half(scale: float) -> None:
+    """The middle half of a box from 8 to 48 by 12 to 36 px is 18 to 38 by 18 to 30 px."""
+    box = LabelledObject(0, (8.0, 12.0, 48.0, 36.0))
+    sample = Sample(Path("a.png"), "a.png", 64, 80, (box,), "")
+    expected = np.zeros((int(80 * scale), int(64 * scale)), dtype=bool)
+    expected[int(18 * scale) : int(30 * scale), int(18 * scale) : int(38 * scale)] = True
+    assert (_object_pixels(box, sample, *expected.shape[::-1], as_box=True) == expected).all()
 
 
 def _write_rings(root: Path, count: int, *, first: int, boxes: bool) -> Path:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mitsplat.detector.labelled_sets.labelled_set import match_classes
 from mitsplat.detector.labelled_sets.set_reading import read_set
 from mitsplat.errors import InputError
 from tests.detector.painted import write_coco, write_yolo
@@ -163,6 +164,20 @@ def test_faults_of_a_coco_file_are_one_sentence(
 def test_images_are_found_in_the_unicode_form_of_macos(tmp_path: Path) -> None:
     image = {"id": 1, "file_name": unicodedata.normalize("NFD", f"{NAME}.png")}
     assert len(read_set(coco(tmp_path, {}, images=[image]), "train").samples) == 1
+
+
+def test_images_of_other_classes_alone_become_images_without_objects(tmp_path: Path) -> None:
+    """Labels of other classes are left out, and the class index follows the order of the detector's classes."""
+    root = yolo(tmp_path, ("a.png", "b.png", "c.png"), ("a.txt", "b.txt", "c.txt"))
+    for name, classes in (("a", "0"), ("b", "1"), ("c", "01")):
+        (root / f"labels/train/{name}.txt").write_text("".join(f"{one} 0.5 0.5 0.2 0.{one}5\n" for one in classes))
+    found = read_set(root, "train")
+    only = match_classes(found, ("bolt",), "the detector")
+    assert [[one.class_index for one in sample.instances] for sample in only.samples] == [[], [0], [0]]
+    assert dict(only.other_labels) == {"nut": 2}
+    turned = match_classes(found, ("bolt", "nut"), "the detector")
+    assert [[one.class_index for one in sample.instances] for sample in turned.samples] == [[1], [0], [1, 0]]
+    assert dict(turned.other_labels) == {}
 
 
 @pytest.mark.parametrize("side", [(0, -1), (1, -1), (0, 1), (1, 1)], ids=["left", "top", "right", "bottom"])

@@ -123,16 +123,20 @@ def test_every_draw_has_its_histogram() -> None:
     assert "objects[3].id" not in page
 
 
-def test_camera_angles_follow_from_its_position() -> None:
-    values = dict(variety._camera_values(record(eye=(0, -1, 1))))
-    assert values["camera elevation [degrees]"] == pytest.approx(45)
-    assert values["camera azimuth [degrees]"] == pytest.approx(270)
-    assert values["camera roll [degrees]"] == pytest.approx(0, abs=1e-6)
-    tilted = record(eye=(0, -1, 1))
-    pose = np.array(tilted["camera"]["world_from_camera"])
-    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", 10, degrees=True).as_matrix()
-    tilted["camera"]["world_from_camera"] = pose.tolist()
-    assert dict(variety._camera_values(tilted))["camera roll [degrees]"] == pytest.approx(10)
+@pytest.mark.parametrize("eye", [(0, -1, 1), (0.6, -1, 0.4), (-2, 0.5, -1)])
+@pytest.mark.parametrize("roll", [0, 10, -100])
+def test_camera_angles_follow_from_its_position(eye: tuple[float, float, float], roll: float) -> None:
+    """The camera looks at the origin, so its position in spherical coordinates gives the angles."""
+    rolled = record(eye=eye)
+    pose = np.array(rolled["camera"]["world_from_camera"])
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
+    rolled["camera"]["world_from_camera"] = pose.tolist()
+    values = dict(variety._camera_values(rolled))
+    x, y, z = eye
+    assert values["camera elevation [degrees]"] == pytest.approx(np.degrees(np.arcsin(z / np.linalg.norm(eye))))
+    assert values["camera azimuth [degrees]"] == pytest.approx(np.degrees(np.angle(complex(x, y))) % 360)
+    assert values["camera roll [degrees]"] == pytest.approx(roll, abs=1e-6)
+    assert [values[f"camera position {axis} [m]"] for axis in "xyz"] == pytest.approx(eye)
 
 
 def test_samples_are_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:

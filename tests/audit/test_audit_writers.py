@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from pycocotools import mask as coco_mask
@@ -30,8 +31,9 @@ from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.camera_spec import Intrinsics
 from mitsplat.scene.spec.image_spec import TimeOfFlightSensor
 from mitsplat.scene.spec.scene_spec import FORMATS
-from tests.conftest import BOTH, small_scene
+from tests.conftest import BOTH, box_asset, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
+from tests.manifests import records_of, store
 
 Patch = Callable[[pytest.MonkeyPatch], None]
 
@@ -473,6 +475,30 @@ def test_poses_that_differ_from_the_layout_are_violations(scene: Scene, tmp_path
     texts = [text for _, text in audit_dataset(out).violations]
     assert any("has another pose than in layouts/0000.json" in text for text in texts)
     assert "is of layout 1" in texts
+
+
+@pytest.mark.parametrize("shift", [0, 3])
+def test_flow_may_differ_by_the_rounding_of_depth(scene: Scene, tmp_path: Path, shift: int) -> None:
+    """Depths in units of 100 mm contain the true depth, from which the flow was computed, unless they are shifted."""
+    out = write(scene, tmp_path / "out", ["depth", "flow"])
+    records = records_of(out)
+    for one in records:
+        path = out / f"depth/{one['split']}/{one['index']:06d}.png"
+        millimetres = one["depth_scale"] * cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), (np.rint(millimetres / 100) + shift).astype(np.uint16))
+        one["depth_scale"] = 100.0
+    store(out, records)
+    found = {file for file, _ in audit_dataset(out).violations if file.startswith("flow/")}
+    assert found == ({file for one in records for file in one["files"] if file.startswith("flow/")} if shift else set())
+
+
+def test_small_objects_far_from_the_image_corner_have_no_violation(tmp_path: Path) -> None:
+    """Offsets between silhouettes and poses are compared with the size of objects, about 10 of 240 px."""
+    sizes = {"nut": (0.02, 0.025, 0.015), "bolt": (0.012, 0.012, 0.04)}
+    boxes = [box_asset(name, size) for name, size in sizes.items()]
+    scene = small_scene(tmp_path, boxes, BOTH, layouts=4, views=2, width=240, height=180, formats=["yolo"])
+    found = audit_dataset(write_dataset(scene, tmp_path / "out", render=render_boxes, settle=scatter_boxes).path)
+    assert found.violations == () and found.instances > 24
 
 
 WRITERS = ("formats", "frames", "labels", "plugins", "renderer")

@@ -246,6 +246,18 @@ def test_a_distance_determines_scale_and_the_table_the_vertical(blank: dict[str,
     assert abs(errors(found.matrix)[0]) < 0.02
 
 
+@pytest.mark.parametrize("height", [-0.03, 0.02])
+def test_the_origin_lies_on_the_table_below_the_target(blank: dict[str, Path], height: float) -> None:
+    """The cameras are directed at (0.01, 0, 0), above or below the table, and the first one looks along x."""
+    cameras = ring(rolled=True)
+    model = model_of(cameras, table_and_thing() + np.array((0, 0, height)))
+    gap = float(np.linalg.norm(cameras[0].centre - cameras[4].centre))
+    whole = find_metric_frame(model, blank, scale_from=("00.png", "04.png", gap)).matrix @ LOST
+    np.testing.assert_allclose(whole @ (0.01, 0, height, 1), (0, 0, 0, 1), atol=3e-4)
+    ahead = whole[:3, :3] @ cameras[0].world_from_camera[:3, 2]
+    assert ahead[0] > 0.5 and abs(ahead[1]) < 1e-3 and ahead[2] < 0
+
+
 @pytest.mark.parametrize(
     ("spots", "sentence"),
     [

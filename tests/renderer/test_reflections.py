@@ -228,6 +228,26 @@ def test_metal_shows_the_highlights_of_another_metal_as_bright_as_a_path_tracer(
     assert usual == pytest.approx(exact, rel=0.1)
 
 
+def test_a_matt_object_before_metal_surroundings_mirrors_nothing() -> None:
+    """A point light at distance sqrt(2), 45 degrees beside the normal, gives the irradiance I cos / d^2 = I / 8^0.5."""
+    make_integrator()
+
+    def of_material(splats: Splats, metallic: float) -> Splats:
+        uniform = SplatMaterials.uniform(len(splats), metallic=metallic, roughness=0.3, specular=0.0)
+        return replace(splats, materials=uniform)
+
+    shapes = {
+        "metal": make_splats_shape(of_material(floor(1.0, z=-0.2), 1.0), proxy=slab(1.0, -0.2)),
+        "matt": make_splats_shape(of_material(floor(0.3), 0.0), proxy=slab(0.3), instance=1),
+        "lamp": {"type": "point", "position": [1, 0, 1], "intensity": 6.0},
+    }
+    integrator = make_integrator(bounce=False, white=float(np.pi))
+    seen = render_layers(integrator, mi.load_dict({"type": "scene", **shapes}), down_camera())
+    assert (seen.instance[14:18, 14:18] == 1).all()
+    np.testing.assert_allclose(seen.light[14:18, 14:18].mean(), 6 / 8**0.5 / np.pi, rtol=1e-3)
+    assert not seen.highlight[14:18, 14:18].any()
+
+
 def test_mirror_shows_an_object_at_its_image() -> None:
     """A grey box on the mirror, upside down: the mirror image lies below the box, where the sky is white elsewhere."""
     make_integrator()

@@ -91,6 +91,11 @@ class Hit:
     roughness: mi.Float
     specular: mi.Float
 
+    @property
+    def gloss(self) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Metalness, roughness and specular."""
+        return self.metallic, self.roughness, self.specular
+
     @classmethod
     def miss(cls) -> Hit:
         """Return a miss."""
@@ -262,21 +267,18 @@ class TraceScene:
         flip = dr.select(dr.dot(si.n, ray.d) > 0, -1.0, 1.0)
         normal, lift = self._smooth(si, flip, proxy)
         face = si.n * flip
-        gloss = other.metallic, other.roughness, other.specular
+        gloss = Hit.miss().gloss
         if self.materials is not None and self.materials.glossy:
             own = self.materials.at(si.prim_index, si.uv, proxy)
-            values = (own.metallic, 0.0), (own.roughness, 1.0), (own.specular, 0.0)
-            gloss = tuple(
-                dr.select(closer, dr.select(proxy, value, matt), rest)
-                for (value, matt), rest in zip(values, gloss, strict=True)
-            )
+            values = own.metallic, own.roughness, own.specular
+            gloss = tuple(dr.select(proxy, value, matt) for value, matt in zip(values, gloss, strict=True))
         return Hit(
             dr.select(closer, si.t, other.distance),
             dr.select(closer, face, other.face),
             dr.select(closer, dr.select(proxy, normal, face), other.normal),
             dr.select(closer, dr.select(proxy, lift, 0), other.lift),
             dr.select(closer, number, other.instance),
-            *gloss,
+            *(dr.select(closer, value, rest) for value, rest in zip(gloss, other.gloss, strict=True)),
         )
 
     def surface_at(self, triangle: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> SurfaceMaterial:

@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 
 from mitsplat.errors import InputError
-from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.quality import resolve_quality
 from mitsplat.renderer.composition.layer_renderer import LayerRenderer
@@ -162,9 +161,9 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             given.refuse("shadow_error", "be in [0, 1)", shadow_error)
         if not 0 <= sky_reach < np.inf:
             given.refuse("sky_reach", "be >= 0", sky_reach)
-        self._is_kernel_stated = "kernel" in props
         self.renderer = LayerRenderer(
             quality=replace(resolve_quality(given.string("quality", "balanced")), **refined),
+            is_kernel_stated="kernel" in props,
             shadow=given.choice("shadow", "traced", "none"),
             occluders=given.choice("occluders", "proxies", "splats"),
             shadow_error=shadow_error,
@@ -196,15 +195,8 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
         """Render an image tensor (H, W, 4 + AOVs), linear RGBA first."""
         if not isinstance(sensor, mi.Sensor):
             sensor = scene.sensors()[sensor]
-        quality = self.renderer.quality
-        if not self._is_kernel_stated and quality.kernel == "exact":
-            kernel = trained_kernel(shape.splats.kernel for shape in scene.shapes() if hasattr(shape, "splats"))
-            self.renderer.quality = replace(quality, kernel=kernel)
-        try:
-            number = int(seed if isinstance(seed, int | np.integer) else seed[0])
-            layers = self.renderer.render_layers(scene, sensor, seed=number)
-        finally:
-            self.renderer.quality = quality  # the next scene may state another kernel
+        number = int(seed if isinstance(seed, int | np.integer) else seed[0])
+        layers = self.renderer.render_layers(scene, sensor, seed=number)
         view = view_of(sensor)
         channels = [*layers["rgb"], layers["alpha"], *layers["captured"], layers["depth"], mi.Float(layers["instance"])]
         channels += [layers["proxy_depth"], mi.Float(layers["proxy_instance"]), *layers["normal"]]

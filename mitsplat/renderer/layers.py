@@ -16,6 +16,7 @@ import trimesh
 
 from mitsplat.arguments import check_type
 from mitsplat.arrays import AnyArray, BoolArray, Float32Array, Float64Array
+from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.geometry.camera import Camera
@@ -99,13 +100,26 @@ class Layers(LazyValue):
 
 
 def make_integrator(*, quality: str | Quality = "balanced", **properties: Any) -> mi.Integrator:
-    """Create the integrator ``splat_proxy``; ``properties`` are those of the plugin.
+    """Create the integrator ``splat_proxy``.
 
     The integrator keeps its uploads as long as the shapes of the scene stay the same.
+
+    Args:
+        quality: Name of a preset, or a complete :class:`mitsplat.quality.Quality`.
+        properties: Further properties of the plugin. Those that refine a preset, such as ``kernel``, are refused with a
+            complete quality.
+
+    Raises:
+        InputError: If there is no such preset, or a property breaks a rule.
     """
     ensure_variant()
+    if not isinstance(quality, Quality):
+        resolve_quality(quality)  # Mitsuba would wrap its error
+        return mi.load_dict({"type": "splat_proxy", "quality": quality, **properties})
+    for name in sorted(properties.keys() & {field.name for field in fields(Quality)}):
+        raise InputError(f"make_integrator: {name!r} must not be given together with a Quality, which has its value")
     integrator = mi.load_dict({"type": "splat_proxy", **properties})
-    integrator.renderer.quality = resolve_quality(quality)
+    integrator.renderer.quality, integrator.renderer.is_kernel_stated = quality, True
     return integrator
 
 
@@ -200,7 +214,7 @@ def render_splats(splats: Splats, camera: Camera, *, quality: str | Quality = "b
 def _single_shape_scene(splats: Splats, variant: str) -> tuple[mi.Integrator, mi.Scene]:
     """Return cached integrator and scene of splats, so that the next view of them needs no upload."""
     scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(splats, instance=1)})
-    return make_integrator(shadow="none"), scene
+    return make_integrator(quality=Quality(), shadow="none"), scene
 
 
 def render_layers(integrator: mi.Integrator, scene: mi.Scene, camera: Camera, *, seed: int = 0) -> Layers:

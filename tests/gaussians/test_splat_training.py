@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -23,7 +24,12 @@ from mitsplat.gaussians.splat_training import SPZ_FLAGS_OFFSET, merge_filter
 from mitsplat.geometry.camera import Camera
 from mitsplat.mesh_files.mesh_reading import read_mesh_file
 from mitsplat.quality import PRESETS
-from mitsplat.renderer.layers import render_splats
+from mitsplat.renderer.layers import (
+    make_integrator,
+    make_splats_shape,
+    render_layers,
+    render_splats,
+)
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 from tests.gaussians.test_splats import encoded, random_splats, trained_ply
@@ -208,6 +214,21 @@ def test_presets_render_antialiased_splats_with_the_mip_filter() -> None:
     assert np.abs(alpha(None, "fast") - filtered).max() > 0.1
     np.testing.assert_array_equal(alpha("gsplat", "fast"), alpha(None, "fast"))
     np.testing.assert_array_equal(alpha("mip", PRESETS["fast"]), alpha(None, "fast"))
+
+
+def test_the_integrator_in_python_uses_the_kernel_that_splats_state() -> None:
+    ensure_variant()
+
+    def alpha(stated: str | None, **options: Any) -> np.ndarray:
+        scene = mi.load_dict({"type": "scene", "splats": make_splats_shape(thin_splats(stated))})
+        return render_layers(make_integrator(shadow="none", **options), scene, CAMERA).alpha
+
+    filtered, exact = alpha(None, kernel="mip"), alpha(None, kernel="exact")
+    assert np.abs(exact - filtered).max() > 0.1
+    np.testing.assert_array_equal(alpha("mip"), filtered)
+    np.testing.assert_array_equal(alpha(None), exact)
+    np.testing.assert_array_equal(alpha("mip", kernel="exact"), exact)
+    np.testing.assert_array_equal(alpha("mip", quality=PRESETS["balanced"]), exact)
 
 
 def test_an_xml_scene_uses_the_kernel_that_its_splats_state(tmp_path: Path) -> None:

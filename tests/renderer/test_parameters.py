@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
@@ -9,6 +10,8 @@ import pytest
 
 from mitsplat.errors import InputError
 from mitsplat.plugins.parameters import Parameters
+from mitsplat.quality import PRESETS, Quality
+from mitsplat.renderer.layers import make_integrator
 from mitsplat.runtime.variant import ensure_variant
 
 
@@ -64,3 +67,14 @@ def test_parameters_of_another_type_or_range_are_refused(
     with pytest.raises(InputError) as caught:
         getattr(given(x=value), method)("x", *limits)
     assert str(caught.value) == f"shape 'splats': {sentence}"
+
+
+def test_the_integrator_in_python_refines_a_preset_as_in_xml() -> None:
+    refined = {"response": "ewa", "kernel": "mip", "samples": 4, "lens_rings": 3}
+    assert make_integrator(quality="fast", **refined).renderer.quality == replace(PRESETS["fast"], **refined)
+    assert make_integrator(quality=Quality(kernel="gsplat")).renderer.quality == Quality(kernel="gsplat")
+
+
+def test_parameters_of_a_complete_quality_are_refused() -> None:
+    with pytest.raises(InputError, match=r"^make_integrator: 'kernel' must not be given together with a Quality, .*$"):
+        make_integrator(quality=Quality(), kernel="mip")

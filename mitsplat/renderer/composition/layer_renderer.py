@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Literal
 
@@ -42,10 +42,12 @@ _CacheKey = tuple[tuple[object, ...], Quality, ShapeState]
 class LayerRenderer:
     """Renderer of the layers of views, with caches that serve the next view.
 
-    The fields are the parameters of the integrator :mod:`mitsplat.plugins.splat_proxy`.
+    The fields are the parameters of the integrator :mod:`mitsplat.plugins.splat_proxy`. Unless ``is_kernel_stated``,
+    the kernel that the splat files state takes the place of that of ``quality``.
     """
 
     quality: Quality
+    is_kernel_stated: bool
     shadow: Literal["traced", "none"]
     occluders: Literal["proxies", "splats"]
     shadow_error: float
@@ -192,7 +194,9 @@ class LayerRenderer:
         pixel = edges.pixels()
         key_at_pixel = dr.gather(mi.UInt32, key, pixel)
         if contents.clouds is not None:
-            splat, own = edges.trace(contents.clouds, contents.placements, self.quality, key_at_pixel, z_max)
+            splat, own = edges.trace(
+                contents.clouds, contents.placements, self._quality_of(contents), key_at_pixel, z_max
+            )
         shown = PrimaryVisibility.of(splat, meshes, emitters, z_max, dr.pi / white)
         other = edges.nearest_other(key, shown.key)
         shares = shown.shares(splat, own, key_at_pixel)
@@ -286,7 +290,7 @@ class LayerRenderer:
         elif contents.clouds is None:
             return {}
         else:
-            found = splat_silhouettes(contents.clouds, contents.placements, view, self.quality)
+            found = splat_silhouettes(contents.clouds, contents.placements, view, self._quality_of(contents))
         return with_area_beyond(found, proxies, view)
 
     def blocked(self, scene: mi.Scene, starts: Float64Array, ends: Float64Array) -> BoolArray:
@@ -294,6 +298,10 @@ class LayerRenderer:
         contents = self._contents.read(scene, self.occluders == "splats")
         found = np.array(contents.proxies.blocked(segments(starts, ends)), dtype=bool)
         return np.broadcast_to(found, len(starts))
+
+    def _quality_of(self, contents: SceneContents) -> Quality:
+        """Return the quality with the kernel of a scene's splats."""
+        return self.quality if self.is_kernel_stated else replace(self.quality, kernel=contents.kernel)
 
     def _white(self) -> mi.Color3f:
         """Return the irradiance (Color3f) at which a white surface has the picture value 1."""
@@ -305,7 +313,7 @@ class LayerRenderer:
         """Return metalness, roughness and luminance at borders of materials, :data:`FROM_PROXY` elsewhere."""
         if contents.mixed is None:
             return mi.Float(FROM_PROXY), mi.Float(FROM_PROXY), mi.Float(FROM_PROXY)
-        return contents.mixed.materials(view, self.quality, hit, splat.instance, z_max)
+        return contents.mixed.materials(view, self._quality_of(contents), hit, splat.instance, z_max)
 
     def _shading_normals(
         self, contents: SceneContents, view: CameraView, hit: Hit, splat: Image, z_max: mi.Float | None
@@ -313,7 +321,7 @@ class LayerRenderer:
         """Return shading normals that replace those of the proxies, zero elsewhere."""
         if contents.normal_mapped is None:
             return mi.Vector3f(0)
-        return contents.normal_mapped.normals(view, self.quality, splat, hit, z_max)
+        return contents.normal_mapped.normals(view, self._quality_of(contents), splat, hit, z_max)
 
     def _shape_votes(self, contents: SceneContents, view: CameraView, z_max: mi.Float | None) -> mi.UInt32 | None:
         """Return the shape of an instance that each pixel shows, or None if all its shapes are lit alike.
@@ -323,7 +331,8 @@ class LayerRenderer:
         if contents.traits.placements is None or contents.clouds is None:
             return None
         fine = view.sampled(self.quality.rays_per_axis)
-        return trace(contents.clouds, contents.traits.placements, fine, self.quality, z_max=z_max).instance
+        quality = self._quality_of(contents)
+        return trace(contents.clouds, contents.traits.placements, fine, quality, z_max=z_max).instance
 
     def _trace_splats(
         self, contents: SceneContents, scene: mi.Scene, view: CameraView, z_max: mi.Float | None
@@ -331,13 +340,13 @@ class LayerRenderer:
         """Render the splats in front of the depths ``z_max`` [m] of meshes and emitters."""
         if contents.clouds is None:
             return Image.empty(view.width * view.height)
-        fine = view.sampled(self.quality.rays_per_axis)
+        fine, quality = view.sampled(self.quality.rays_per_axis), self._quality_of(contents)
         static_tiles = self._static_tile_cache(contents, scene, fine, z_max)
         if static_tiles is not None:
             objects = [p for p in contents.placements if p.instance]
             with suppress(CrowdedError):
-                return static_tiles.with_objects(contents.clouds, objects, fine, self.quality, z_max)
-        return trace(contents.clouds, contents.placements, fine, self.quality, z_max=z_max)
+                return static_tiles.with_objects(contents.clouds, objects, fine, quality, z_max)
+        return trace(contents.clouds, contents.placements, fine, quality, z_max=z_max)
 
     def _static_tile_cache(
         self, contents: SceneContents, scene: mi.Scene, view: CameraView, z_max: mi.Float | None
@@ -351,11 +360,12 @@ class LayerRenderer:
         fixed = [s for s in contents.state.shapes if getattr(s, "instance", 0) == 0]
         if not self.hide_emitters:
             fixed += [s for s in scene.shapes() if s.is_emitter()]
-        if self._static_tiles is None or not _is_key_of(self._static_tiles[0], view, self.quality, fixed):
-            self._static_tiles = (view.key, self.quality, ShapeState.of(fixed)), None
+        quality = self._quality_of(contents)
+        if self._static_tiles is None or not _is_key_of(self._static_tiles[0], view, quality, fixed):
+            self._static_tiles = (view.key, quality, ShapeState.of(fixed)), None
         elif self._static_tiles[1] is None:
             with suppress(CrowdedError):
-                cache = StaticTileCache.of(contents.clouds, static, view, self.quality, z_max)
+                cache = StaticTileCache.of(contents.clouds, static, view, quality, z_max)
                 self._static_tiles = self._static_tiles[0], cache
         return self._static_tiles[1]
 

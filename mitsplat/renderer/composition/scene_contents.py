@@ -8,6 +8,8 @@ import mitsuba as mi
 
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.gaussians.splat_training import trained_kernel
+from mitsplat.quality import KernelName
 from mitsplat.renderer.composition.material_borders import MixedObjects
 from mitsplat.renderer.composition.shading_normals import NormalMappedShapes
 from mitsplat.renderer.composition.shape_state import ShapeState
@@ -42,6 +44,7 @@ class SceneContents:
         grid: Captured colours of the surroundings, for light that they reflect; None without surroundings.
         mixed: Objects with metal and plastic, whose borders are blended; None if there are none.
         normal_mapped: Shapes with normals finer than their proxy meshes; None if there are none.
+        kernel: Kernel that the splat files state, see :func:`mitsplat.gaussians.splat_training.trained_kernel`.
     """
 
     state: ShapeState
@@ -54,6 +57,7 @@ class SceneContents:
     grid: RadianceGrid | None
     mixed: MixedObjects | None
     normal_mapped: NormalMappedShapes | None
+    kernel: KernelName
 
 
 class ContentsReader:
@@ -102,6 +106,7 @@ class ContentsReader:
             self._surroundings(carriers),
             MixedObjects.of(carriers, placements),
             NormalMappedShapes.of(carriers, placements),
+            trained_kernel(splats.kernel for splats in distinct),
         )
         return self._contents
 

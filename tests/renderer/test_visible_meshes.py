@@ -189,6 +189,15 @@ def test_uniform_splats_are_relit_in_a_mirror() -> None:
     assert seen.rgb[15:17, 15:17].mean() == pytest.approx(2 * got["scene"], rel=0.05)
 
 
+@pytest.mark.parametrize(("lights", "shadow"), [({}, "traced"), ({"sky": WHITE_SKY}, "none")])
+def test_splats_that_are_not_relit_have_their_colours_in_a_mirror(lights: dict[str, Any], shadow: str) -> None:
+    ensure_variant()
+    splats = make_splats_shape(floor(1.0, 0.6, 1.5), instance=1)
+    scene = mi.load_dict({"type": "scene", "mirror": mirror(), "splats": splats, **lights})
+    seen = render_layers(make_integrator(mesh_samples=16, white=2.0, shadow=shadow), scene, down_camera())
+    assert seen.rgb[12:20, 12:20].mean() == pytest.approx(((0.6 + 0.055) / 1.055) ** 2.4, rel=0.02)
+
+
 def test_the_camera_sees_emitters_unless_they_are_hidden() -> None:
     ensure_variant()
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.4, 0.8]}}

@@ -121,7 +121,7 @@ class LayerRenderer:
         shown = PrimaryVisibility.of(splat, meshes, emitters, z_max, dr.pi / white)
         radiance = self._radiance(contents, scene, view, rays, meshes, shown, white, paths, seed)
         light, highlight = mi.Color3f(1), mi.Color3f(0)
-        if self.shadow == "traced" and scene.emitters():
+        if self._is_lit(scene):
             metallic, roughness, luminance = self._border_materials(contents, view, hit, splat, z_max)
             shown = shown.with_luminance(luminance)
             mesh = shown.diffuse & shown.front
@@ -264,6 +264,7 @@ class LayerRenderer:
             white=white,
             max_depth=self.max_depth,
             bounce=self.bounce,
+            relights=self._is_lit(scene),
             seed=seed,
         )
         found = tracer.radiance(view, ray, hit, pixel, paths)
@@ -302,6 +303,10 @@ class LayerRenderer:
     def _quality_of(self, contents: SceneContents) -> Quality:
         """Return the quality with the kernel of a scene's splats."""
         return self.quality if self.is_kernel_stated else replace(self.quality, kernel=contents.kernel)
+
+    def _is_lit(self, scene: mi.Scene) -> bool:
+        """Return True if emitters light the splats; otherwise splats have their colours as stored."""
+        return self.shadow == "traced" and bool(scene.emitters())
 
     def _white(self) -> mi.Color3f:
         """Return the irradiance (Color3f) at which a white surface has the picture value 1."""

@@ -65,6 +65,7 @@ class PathTracer:
         white: Irradiance (Color3f) under which uniformly captured colours are shown unchanged.
         max_depth: Largest path length, counted as in Mitsuba: 2 is direct light.
         bounce: True if splats light diffuse surfaces; mirrors always show splats.
+        relights: True if the scene's emitters light splats that were captured under uniform light.
         seed: Seed of all random numbers.
     """
 
@@ -76,6 +77,7 @@ class PathTracer:
     white: mi.Color3f
     max_depth: int
     bounce: bool
+    relights: bool
     seed: int
 
     def radiance(
@@ -230,9 +232,12 @@ class PathTracer:
             colour = dr.select(smooth, 0, colour)
         colour = dr.select(nearer, colour * path.throughput, 0)
         dr.eval(splat_hits, colour, key, nearer)
+        if not self.relights:
+            _add(result, path.lane, colour)
+            return splat_hits
         _add(result, path.lane, dr.select(splat_hits.relit, 0, colour))
         anew = dr.compress(nearer & splat_hits.relit)
-        if dr.width(anew) and self.scene.emitters():
+        if dr.width(anew):
             ray, normal = dr.gather(mi.Ray3f, path.ray, anew), dr.gather(mi.Vector3f, splat_hits.normal, anew)
             place = ray(dr.gather(mi.Float, splat_hits.distance, anew))
             si = receiver(place, normal)

@@ -13,6 +13,7 @@ from mitsplat.errors import InputError
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.quality import resolve_quality
 from mitsplat.renderer.composition.layer_renderer import LayerRenderer
+from mitsplat.renderer.meshes.mesh_radiance import MAX_DEPTH
 from mitsplat.renderer.rays.sensors import view_of
 from mitsplat.runtime.dropped_rays import check_dropped_rays
 
@@ -173,7 +174,7 @@ class SplatProxyIntegrator(mi.CppADIntegrator):
             highlight=given.boolean("highlight", True),
             hide_emitters=given.boolean("hide_emitters", False),
             mesh_samples=given.integer("mesh_samples", 64, 1, 65536),
-            max_depth=given.integer("max_depth", 8, 2, 64),
+            max_depth=given.integer("max_depth", 8, 2, MAX_DEPTH),
             white=given.colour("white", np.pi),
             sky_reach=sky_reach,
             reference=given.point("reference", (0.0, 0.0, 0.0)),

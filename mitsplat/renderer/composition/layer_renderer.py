@@ -260,7 +260,6 @@ class LayerRenderer:
             scene,
             contents.proxies,
             contents.mirror,
-            exposure=dr.pi / white,
             white=white,
             max_depth=self.max_depth,
             bounce=self.bounce,

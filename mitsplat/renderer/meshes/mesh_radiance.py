@@ -17,7 +17,6 @@ from mitsplat.renderer.materials.principled import power_weight
 from mitsplat.renderer.meshes.mirrored_splats import SplatHits, SplatMirror
 from mitsplat.renderer.meshes.visible_meshes import VisibleMeshes, has_bsdf_flag
 from mitsplat.renderer.occluders.proxies import Proxies
-from mitsplat.renderer.projection.gaussian import srgb_to_linear
 from mitsplat.renderer.rays.camera_rays import CameraView
 from mitsplat.renderer.rays.device_arrays import gathered, opaque_seed, unit_float
 
@@ -27,8 +26,16 @@ LANES = 1 << 20
 R7 = (3915259345, 3569120481, 3253582939, 2965941329, 2703729436, 2464699080, 2246800835)
 """Additive recurrence of seven dimensions in units of 2^-32 (Roberts 2018): powers of 1/g with g^8 = g + 1."""
 
-PER_VERTEX = 16
-"""Random numbers that are reserved for each vertex of a path."""
+MAX_DEPTH = 64
+"""Largest path length, counted as in Mitsuba: 2 is direct light."""
+
+
+class _Dimension:
+    """Random numbers of a vertex of a path: first number of each choice, and the key of stochastic occluders."""
+
+    EMITTER, LOBE, DIRECTION, PIXEL, EMITTER_OF_SPLATS, KEY = 0, 2, 3, 5, 7, 9
+    COUNT = 16
+
 
 ROUNDS = 8
 """Rounds of the hash behind the random numbers (Zafar et al. 2010). After four rounds, the numbers of adjacent pixels
@@ -61,7 +68,6 @@ class PathTracer:
         scene: Complete scene with its emitters.
         proxies: Additional occluders.
         mirror: Splats that paths may hit, or None.
-        exposure: Factor from radiance to the picture's scale (Color3f).
         white: Irradiance (Color3f) under which uniformly captured colours are shown unchanged.
         max_depth: Largest path length, counted as in Mitsuba: 2 is direct light.
         bounce: True if splats light diffuse surfaces; mirrors always show splats.
@@ -73,12 +79,16 @@ class PathTracer:
     scene: mi.Scene
     proxies: Proxies
     mirror: SplatMirror | None
-    exposure: mi.Color3f
     white: mi.Color3f
     max_depth: int
     bounce: bool
     relights: bool
     seed: int
+
+    @property
+    def exposure(self) -> mi.Color3f:
+        """Factor from radiance to the picture's scale."""
+        return dr.pi / self.white
 
     def radiance(
         self, view: CameraView, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, pixel: mi.UInt32, samples: int
@@ -118,7 +128,8 @@ class PathTracer:
         row = numbers.pixel // view.width
         other = mi.Ray3f(ray)
         x, y = mi.Float(numbers.pixel - row * view.width), mi.Float(row)
-        other.d = view.direction(x + numbers.number_of(0, 5), y + numbers.number_of(0, 6))
+        dx, dy = numbers.point(0, _Dimension.PIXEL)
+        other.d = view.direction(x + dx, y + dy)
         jittered = self.meshes.scene.ray_intersect_preliminary(other, coherent=True)
         usable = jittered.is_valid() & ~self.meshes.is_diffuse(jittered)
         return dr.select(usable, other, ray), dr.select(usable, jittered, hit)
@@ -131,16 +142,16 @@ class PathTracer:
             own = gathered(numbers, path.lane)
             si = self._interaction(path)
             bsdf, context = si.bsdf(path.ray), mi.BSDFContext()
-            u = [own.number_of(depth, i) for i in range(5)]
             if lights:
-                self._add_direct(result, path, si, bsdf, context, mi.Point2f(u[0], u[1]), own.key(depth))
-            sample, weight = bsdf.sample(context, si, u[2], mi.Point2f(u[3], u[4]))
+                self._add_direct(result, path, si, bsdf, context, own.point(depth, _Dimension.EMITTER), own.key(depth))
+            lobe, direction = own.number_of(depth, _Dimension.LOBE), own.point(depth, _Dimension.DIRECTION)
+            sample, weight = bsdf.sample(context, si, lobe, direction)
             throughput = path.throughput * weight
             ray = si.spawn_ray(si.to_world(sample.wo))
             delta = has_bsdf_flag(sample.sampled_type, "Delta")
-            smooth = has_bsdf_flag(sample.sampled_type, "Diffuse")
+            diffuse = has_bsdf_flag(sample.sampled_type, "Diffuse")
             at, density = mi.Point3f(si.p), mi.Float(sample.pdf)
-            dr.eval(throughput, ray, delta, smooth, at, density)
+            dr.eval(throughput, ray, delta, diffuse, at, density)
             alive = dr.compress(dr.max(throughput) > 0)
             if not dr.width(alive):
                 break
@@ -152,7 +163,7 @@ class PathTracer:
             dr.eval(hit)
             path = _Path(lane, ray, hit, throughput)
             continuing = hit.is_valid()
-            splat_hits = self._add_splats(path, dr.gather(mi.Bool, smooth, alive), numbers, depth, result)
+            splat_hits = self._add_splats(path, dr.gather(mi.Bool, diffuse, alive), numbers, depth, result)
             if splat_hits is not None:
                 continuing &= splat_hits.distance >= hit.t
             if lights:
@@ -193,13 +204,13 @@ class PathTracer:
         key: mi.UInt32,
     ) -> None:
         """Add the direct light of one sampled emitter."""
-        rough = has_bsdf_flag(bsdf.flags(), "Smooth")
-        towards, light = self.scene.sample_emitter_direction(si, point, False, rough)
+        scatters = has_bsdf_flag(bsdf.flags(), "Smooth")  # other than into single directions
+        towards, light = self.scene.sample_emitter_direction(si, point, False, scatters)
         out = si.to_local(towards.d)
-        value, density = bsdf.eval_pdf(context, si, out, rough & (towards.pdf > 0))
+        value, density = bsdf.eval_pdf(context, si, out, scatters & (towards.pdf > 0))
         weight = dr.select(towards.delta, 1, power_weight(towards.pdf, density))
         arrives = path.throughput * value * light * self.exposure * weight
-        arrives = dr.select(rough & (towards.pdf > 0), arrives, 0)
+        arrives = dr.select(scatters & (towards.pdf > 0), arrives, 0)
         ray = si.spawn_ray_to(si.p + towards.d * towards.dist)
         infinite = _has_emitter_flag(towards.emitter, mi.EmitterFlags.Infinite)
         ray.maxt = dr.select(infinite, dr.inf, ray.maxt)
@@ -218,41 +229,53 @@ class PathTracer:
         _add(result, lane, dr.select(free, light, 0))
 
     def _add_splats(
-        self, path: _Path, smooth: mi.Bool, numbers: _RandomNumbers, depth: int, result: mi.Color3f
+        self, path: _Path, diffuse: mi.Bool, numbers: _RandomNumbers, depth: int, result: mi.Color3f
     ) -> SplatHits | None:
-        """Add the light of splats that paths hit."""
+        """Add the light of splats that paths hit; ``diffuse`` marks paths that a diffuse lobe has reflected."""
         if self.mirror is None:
             return None
         own = gathered(numbers, path.lane)
         key = own.key(depth)
-        splat_hits = self.mirror.trace(path.ray, key, True)
-        colour = mi.Color3f(*[srgb_to_linear(c) for c in splat_hits.colour])
-        nearer = splat_hits.distance < path.hit.t
+        splat_hits = self.mirror.trace(path.ray, key)
+        colour, nearer = splat_hits.colour, splat_hits.distance < path.hit.t
         if not self.bounce:
-            colour = dr.select(smooth, 0, colour)
+            colour = dr.select(diffuse, 0, colour)
         colour = dr.select(nearer, colour * path.throughput, 0)
         dr.eval(splat_hits, colour, key, nearer)
         if not self.relights:
             _add(result, path.lane, colour)
             return splat_hits
         _add(result, path.lane, dr.select(splat_hits.relit, 0, colour))
-        anew = dr.compress(nearer & splat_hits.relit)
-        if dr.width(anew):
-            ray, normal = dr.gather(mi.Ray3f, path.ray, anew), dr.gather(mi.Vector3f, splat_hits.normal, anew)
-            place = ray(dr.gather(mi.Float, splat_hits.distance, anew))
-            si = receiver(place, normal)
-            numbers_here = gathered(own, anew)
-            point = mi.Point2f(numbers_here.number_of(depth, 7), numbers_here.number_of(depth, 8))
-            towards, light = self.scene.sample_emitter_direction(si, point, False)
-            cosine = dr.maximum(dr.dot(normal, towards.d), 0)
-            lit = dr.gather(mi.Color3f, colour, anew) * light * cosine / self.white
-            infinite = _has_emitter_flag(towards.emitter, mi.EmitterFlags.Infinite)
-            off = dr.gather(mi.Float, splat_hits.footprint, anew)
-            shadow = mi.Ray3f(place + normal * off, towards.d)
-            shadow.maxt = dr.select(infinite, dr.inf, dr.maximum(towards.dist * (1 - 1e-3) - off, 0))
-            lane = dr.gather(mi.UInt32, path.lane, anew)
-            self._add_unoccluded(result, lane, shadow, lit, dr.gather(mi.UInt32, key, anew))
+        relit = dr.compress(nearer & splat_hits.relit)
+        if dr.width(relit):
+            self._add_relit_splats(
+                result,
+                gathered(path, relit),
+                gathered(splat_hits, relit),
+                dr.gather(mi.Color3f, colour, relit),
+                gathered(own, relit).point(depth, _Dimension.EMITTER_OF_SPLATS),
+                dr.gather(mi.UInt32, key, relit),
+            )
         return splat_hits
+
+    def _add_relit_splats(
+        self,
+        result: mi.Color3f,
+        path: _Path,
+        splat_hits: SplatHits,
+        colour: mi.Color3f,
+        point: mi.Point2f,
+        key: mi.UInt32,
+    ) -> None:
+        """Add the direct light of one sampled emitter on splats of a captured ``colour`` (Color3f)."""
+        place = path.ray(splat_hits.distance)
+        towards, light = self.scene.sample_emitter_direction(receiver(place, splat_hits.normal), point, False)
+        cosine = dr.maximum(dr.dot(splat_hits.normal, towards.d), 0)
+        infinite = _has_emitter_flag(towards.emitter, mi.EmitterFlags.Infinite)
+        off = splat_hits.footprint
+        shadow = mi.Ray3f(place + splat_hits.normal * off, towards.d)
+        shadow.maxt = dr.select(infinite, dr.inf, dr.maximum(towards.dist * (1 - 1e-3) - off, 0))
+        self._add_unoccluded(result, path.lane, shadow, colour * light * cosine / self.white, key)
 
     def _add_emission(
         self,
@@ -283,7 +306,12 @@ class _RandomNumbers:
 
     def key(self, depth: int) -> mi.UInt32:
         """Return an integer that differs between paths and vertices."""
-        return self.pixel * 0x9E3779B1 + self.number * PER_VERTEX * 64 + self._dimension(depth, 9) + self.seed
+        dimension = self._dimension(depth, _Dimension.KEY)
+        return self.pixel * 0x9E3779B1 + self.number * _Dimension.COUNT * MAX_DEPTH + dimension + self.seed
+
+    def point(self, depth: int, dimension: int) -> mi.Point2f:
+        """Return a random point of the unit square, from two consecutive dimensions."""
+        return mi.Point2f(self.number_of(depth, dimension), self.number_of(depth, dimension + 1))
 
     def number_of(self, depth: int, dimension: int) -> mi.Float:
         """Return a random number in [0, 1)."""
@@ -295,7 +323,7 @@ class _RandomNumbers:
 
     @staticmethod
     def _dimension(depth: int, dimension: int) -> mi.UInt32:
-        return dr.opaque(mi.UInt32, depth * PER_VERTEX + dimension)
+        return dr.opaque(mi.UInt32, depth * _Dimension.COUNT + dimension)
 
 
 def _has_emitter_flag(emitter: mi.EmitterPtr, flag: mi.EmitterFlags) -> mi.Bool:

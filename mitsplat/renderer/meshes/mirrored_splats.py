@@ -16,7 +16,7 @@ import numpy as np
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.occluders.splat_occlusion import SETS, Caster, Solids
 from mitsplat.renderer.projection.clouds import CloudSet, Placement
-from mitsplat.renderer.projection.gaussian import evaluate_sh, rotation_axes
+from mitsplat.renderer.projection.gaussian import evaluate_sh, rotation_axes, srgb_to_linear
 from mitsplat.renderer.projection.records import AppearanceRow, Geometry
 from mitsplat.renderer.projection.splat_appearance import appearance_rows, apply_appearance
 from mitsplat.renderer.rays.device_arrays import wrapped
@@ -38,14 +38,14 @@ class SplatHits:
 
     Attributes:
         distance: Distance along the ray [m], infinite for a miss.
-        colour: Display-encoded captured colour (three arrays).
+        colour: Linear captured colour (Color3f).
         normal: Normal of the Gaussian's flattest side, towards the ray's origin.
         relit: True if the colour was captured under uniform light.
         footprint: Distance from the surface within which its own splats cast no shadow [m].
     """
 
     distance: mi.Float
-    colour: list[mi.Float]
+    colour: mi.Color3f
     normal: mi.Vector3f
     relit: mi.Bool
     footprint: mi.Float
@@ -97,11 +97,11 @@ class SplatMirror:
             appearances = wrapped(mi.Float, looks)
         return cls(solids, clouds, wrapped(mi.UInt32, owners), wrapped(mi.Float, rows), appearances)
 
-    def trace(self, ray: mi.Ray3f, key: mi.UInt32, active: bool) -> SplatHits:
+    def trace(self, ray: mi.Ray3f, key: mi.UInt32) -> SplatHits:
         """Trace rays against splats; the ``key`` of a ray selects its set of solids."""
         inside, start, met = self.solids.enter(ray, key, mi.Float(0))
-        hit = self.solids.scene.ray_intersect_preliminary(inside, active=active & met)
-        found = active & met & hit.is_valid()
+        hit = self.solids.scene.ray_intersect_preliminary(inside, active=met)
+        found = met & hit.is_valid()
         owner = dr.gather(mi.Point2u, self.gaussians, hit.prim_index, found)
         row = dr.gather(mi.ArrayXf, self.table, owner.x, found, shape=(_MirrorRow.WIDTH, dr.width(owner)))
         rotation = row[_MirrorRow.ROTATION]
@@ -122,7 +122,7 @@ class SplatMirror:
         side = dr.select(dr.dot(side, own) > 0, -side, side)
         return SplatHits(
             distance=dr.select(found, start + hit.t, dr.inf),
-            colour=colour,
+            colour=mi.Color3f(*[srgb_to_linear(c) for c in colour]),
             normal=axes_of[0] * side.x + axes_of[1] * side.y + axes_of[2] * side.z,
             relit=found & (row[_MirrorRow.RELIT] > 0),
             footprint=row[_MirrorRow.FOOTPRINT],

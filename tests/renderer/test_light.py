@@ -581,6 +581,32 @@ def test_kernels_that_trace_one_scene_give_the_same_light(
         assert getattr(one_by_one, name).tobytes() == getattr(together, name).tobytes(), name
 
 
+def test_parts_of_many_shadow_rays_share_their_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a kernel traces one scene, rays are traced 32 at a time: 64 rays in two parts, 256 in eight."""
+    make_integrator()
+    build = Proxies.__init__
+
+    def apart(self: Proxies, *args: Any) -> None:
+        build(self, *args)
+        self.separate_kernels = True
+
+    monkeypatch.setattr(Proxies, "__init__", apart)
+    shapes = {
+        "floor": make_splats_shape(floor(), proxy=slab()),
+        "object": make_splats_shape(nothing(), proxy=trimesh.creation.icosphere(1, 0.05), instance=1),
+        "lamp": {"type": "point", "position": [0.5, 0.2, 0.8], "intensity": {"type": "rgb", "value": 1.0}},
+    }
+
+    def kernels(samples: int) -> set[int]:
+        dr.kernel_history_clear()
+        assert render(shapes, down_camera(), samples=samples, bounce=False).light.min() < 0.5
+        return {entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT}
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        few = kernels(64)
+        assert kernels(256) <= few
+
+
 @pytest.mark.parametrize(("stride", "apart"), [(1, 0.18), (BLOCK * BLOCK, 0.24), (POINT_STEP * BLOCK * BLOCK, 0.11)])
 def test_sample_points_of_rays_do_not_repeat(stride: int, apart: float) -> None:
     """Sample points of neighbours, of one pixel, and of each point of a curved pixel differ.

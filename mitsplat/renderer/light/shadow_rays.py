@@ -120,7 +120,9 @@ class ShadowTracer:
         separate_kernels = self.proxies.separate_kernels
         if separate_kernels and most > WORD_BITS:
             for begin in range(0, most, WORD_BITS):
-                part = dr.minimum(dr.maximum(rays, begin) - begin, WORD_BITS)
+                # As a literal, the start of each part would need a kernel of its own.
+                done = dr.opaque(mi.UInt32, begin)
+                part = dr.minimum(dr.maximum(rays, done) - done, WORD_BITS)
                 before = self.trace(places, before, part, min(WORD_BITS, most - begin), steps, matt=matt)
             return before
         batch = _RayBatch.of(self, places, before, steps)

@@ -90,17 +90,7 @@ class MeshHits:
 
     def before(self, other: Hit) -> Hit:
         """Return the nearer of these hits and other hits of the same rays."""
-        closer = self.valid & (self.hit.t < other.distance)
-        return Hit(
-            dr.select(closer, self.hit.t, other.distance),
-            dr.select(closer, self.face, other.face),
-            dr.select(closer, self.normal, other.normal),
-            dr.select(closer, 0, other.lift),
-            dr.select(closer, 0, other.instance),
-            dr.select(closer, 0, other.metallic),
-            dr.select(closer, 1, other.roughness),
-            dr.select(closer, 0, other.specular),
-        )
+        return Hit.matt(self.hit.t, self.face, self.normal).before(other)
 
 
 @dataclass(frozen=True, eq=False)

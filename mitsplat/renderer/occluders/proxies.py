@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from typing import Protocol
 
@@ -91,16 +91,21 @@ class Hit:
     roughness: mi.Float
     specular: mi.Float
 
-    @property
-    def gloss(self) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Metalness, roughness and specular."""
-        return self.metallic, self.roughness, self.specular
-
     @classmethod
     def miss(cls) -> Hit:
         """Return a miss."""
-        matt = mi.Float(0), mi.Float(1), mi.Float(0)
-        return cls(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.UInt32(0), *matt)
+        return cls.matt(mi.Float(dr.inf), mi.Normal3f(0), mi.Normal3f(0))
+
+    @classmethod
+    def matt(cls, distance: mi.Float, face: mi.Normal3f, normal: mi.Normal3f) -> Hit:
+        """Return hits on a matt surface of the environment; the parameters are those of the fields."""
+        gloss = {"metallic": mi.Float(0), "roughness": mi.Float(1), "specular": mi.Float(0)}
+        return cls(distance, face, normal, lift=mi.Vector3f(0), instance=mi.UInt32(0), **gloss)
+
+    def before(self, other: Hit) -> Hit:
+        """Return the nearer of these hits and other hits of the same rays."""
+        nearer = self.distance < other.distance
+        return Hit(*[dr.select(nearer, getattr(self, f.name), getattr(other, f.name)) for f in fields(Hit)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,9 +229,11 @@ class Proxies:
 
     def nearest(self, ray: mi.Ray3f) -> tuple[Hit, Hit]:
         """Return the first hits of rays, and the first hits without the dynamic objects and visible shapes."""
-        ground = Hit.miss() if self._surroundings is None else self._surroundings.nearest(ray, Hit.miss())
+        ground = Hit.miss()
+        if self._surroundings is not None:
+            ground = self._surroundings.nearest(ray).before(ground)
         dr.eval(ground)  # a separate kernel, see `separate_kernels`
-        return ground if self.dynamic is None else self.dynamic.nearest(ray, ground), ground
+        return ground if self.dynamic is None else self.dynamic.nearest(ray).before(ground), ground
 
     def blocked(self, ray: mi.Ray3f) -> mi.Bool:
         """Return True for rays that hit a proxy before their end."""
@@ -258,28 +265,26 @@ class TraceScene:
     normals: mi.Float
     materials: CornerMaterials | None
 
-    def nearest(self, ray: mi.Ray3f, other: Hit) -> Hit:
-        """Return the nearer of ``other`` and the hits in this scene."""
+    def nearest(self, ray: mi.Ray3f) -> Hit:
+        """Return the first hits of rays."""
         si = self.scene.ray_intersect(ray, mi.RayFlags.UV, coherent=True)
-        closer = si.t < other.distance
-        proxy = closer & (si.shape == self.mesh) if self.mesh is not None else mi.Bool(False)
-        number = dr.gather(mi.UInt32, self.instances, si.prim_index, proxy)
         flip = dr.select(dr.dot(si.n, ray.d) > 0, -1.0, 1.0)
-        normal, lift = self._smooth(si, flip, proxy)
         face = si.n * flip
-        gloss = Hit.miss().gloss
-        if self.materials is not None and self.materials.glossy:
-            own = self.materials.at(si.prim_index, si.uv, proxy)
-            values = own.metallic, own.roughness, own.specular
-            gloss = tuple(dr.select(proxy, value, matt) for value, matt in zip(values, gloss, strict=True))
-        return Hit(
-            dr.select(closer, si.t, other.distance),
-            dr.select(closer, face, other.face),
-            dr.select(closer, dr.select(proxy, normal, face), other.normal),
-            dr.select(closer, dr.select(proxy, lift, 0), other.lift),
-            dr.select(closer, number, other.instance),
-            *(dr.select(closer, value, rest) for value, rest in zip(gloss, other.gloss, strict=True)),
-        )
+        hit = Hit.matt(si.t, face, face)
+        if self.mesh is None:
+            return hit
+        proxy = si.is_valid() & (si.shape == self.mesh)
+        normal, lift = self._smooth(si, flip, proxy)
+        instance = dr.gather(mi.UInt32, self.instances, si.prim_index, proxy)
+        hit = replace(hit, normal=dr.select(proxy, normal, face), lift=dr.select(proxy, lift, 0), instance=instance)
+        if self.materials is None or not self.materials.glossy:
+            return hit
+        own = self.materials.at(si.prim_index, si.uv, proxy)
+        gloss = {
+            name: dr.select(proxy, getattr(own, name), getattr(hit, name))
+            for name in ("metallic", "roughness", "specular")
+        }
+        return replace(hit, **gloss)
 
     def surface_at(self, triangle: mi.UInt32, uv: mi.Point2f, active: mi.Bool) -> SurfaceMaterial:
         """Return the materials at barycentric coordinates of proxy triangles."""

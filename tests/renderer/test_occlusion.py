@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import Layers, make_integrator, make_splats_shape, render_layers
-from mitsplat.renderer.occluders.splat_occlusion import MIN_OPACITY, Caster, SplatOccluders
+from mitsplat.renderer.occluders.splat_occlusion import MIN_OCCLUDING_OPACITY, Caster, SplatOccluders
 from mitsplat.renderer.rays.device_arrays import wrapped
 from tests.renderer.test_light import floor, slab
 
@@ -28,7 +28,7 @@ def transmittance(splats: Splats, origin: np.ndarray, direction: np.ndarray, rea
     d = np.einsum("nij,j->ni", axes, direction) / splats.scales
     t = -(o * d).sum(axis=1) / (d * d).sum(axis=1)
     chance = splats.opacities * np.exp(-0.5 * ((o + t[:, None] * d) ** 2).sum(axis=1))
-    return float(np.prod(1 - chance[(t > 0) & (t < reach) & (chance > MIN_OPACITY)]))
+    return float(np.prod(1 - chance[(t > 0) & (t < reach) & (chance > MIN_OCCLUDING_OPACITY)]))
 
 
 def pane(z: float, opacity: float, *, hole: float = 0.0, width: float = 0.1) -> Splats:
@@ -152,7 +152,7 @@ def test_a_surface_is_not_shadowed_by_its_own_gaussians() -> None:
 
 
 def test_splats_too_faint_to_stop_a_ray_cast_no_shadow() -> None:
-    light = seen({"haze": make_splats_shape(pane(0.7, 0.5 * MIN_OPACITY), instance=1)}).light
+    light = seen({"haze": make_splats_shape(pane(0.7, 0.5 * MIN_OCCLUDING_OPACITY), instance=1)}).light
     assert (light == 1).all()
 
 

@@ -26,7 +26,7 @@ from mitsplat.gaussians.splat_materials import SplatMaterials
 from mitsplat.images.colour import LUMINANCE, decode_srgb
 from mitsplat.quality import Quality
 from mitsplat.renderer.composition.parameter_pass import ParameterPass, parameter_cloud
-from mitsplat.renderer.materials.proxy_materials import MIN_OPACITY, GlossChange
+from mitsplat.renderer.materials.proxy_materials import SURFACE_OPACITY, GlossChange
 from mitsplat.renderer.occluders.proxies import Hit
 from mitsplat.renderer.projection.clouds import Cloud, CloudSet, Placement, merge_clouds
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance, changed_colours
@@ -102,7 +102,7 @@ class MixedObjects:
         image, pixel, inside = found.image, found.pixel, found.inside
         metal, luminance, rough = image.rgb
         mixed = dr.gather(mi.Bool, self.mixed, dr.gather(mi.UInt32, instance, pixel, inside), inside)
-        shown = inside & mixed & (image.alpha > 0.5) & (luminance > 0)
+        shown = found.covered & mixed & (luminance > 0)
         shares = metal / luminance, rough / luminance, luminance / image.alpha
         for values, share in zip(parameters, shares, strict=True):
             value = dr.clip(share, 0, 1)
@@ -140,7 +140,7 @@ def _is_mixed(splats: Splats) -> bool:
     """Return True if the opaque Gaussians have several metalnesses."""
     if splats.materials is None:
         return False
-    metallic = splats.materials.metallic[splats.opacities > MIN_OPACITY]
+    metallic = splats.materials.metallic[splats.opacities > SURFACE_OPACITY]
     return len(metallic) > 0 and float(np.ptp(metallic)) > DIFFERENT
 
 

@@ -33,6 +33,11 @@ class ParameterPass:
     pixel: mi.UInt32
     inside: mi.Bool
 
+    @property
+    def covered(self) -> mi.Bool:
+        """True for pixels inside the picture of which these splats cover more than half."""
+        return self.inside & (self.image.alpha > 0.5)
+
     @classmethod
     def of(
         cls,

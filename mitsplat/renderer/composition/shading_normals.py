@@ -93,8 +93,8 @@ class NormalMappedShapes:
         normal, outward = (_decoded(one.image) for one in (found, flat))
         depth = dr.gather(mi.Float, seen.depth, pixel, inside)
         instance, met = (dr.gather(mi.UInt32, each.instance, pixel, inside) for each in (seen, hit))
-        shown = inside & dr.gather(mi.Bool, self.present, instance, inside)
-        shown &= (image.alpha > 0.5) & (dr.abs(image.depth - depth) < SAME_DEPTH * depth)
+        shown = found.covered & dr.gather(mi.Bool, self.present, instance, inside)
+        shown &= dr.abs(image.depth - depth) < SAME_DEPTH * depth
         proxy = dr.select(instance == met, dr.gather(mi.Normal3f, hit.normal, pixel, inside), dr.normalize(outward))
         shown &= dr.dot(outward, proxy) > SAME_SURFACE
         normal = dr.select(dr.squared_norm(normal) > 0.01, dr.normalize(normal), 0)

@@ -51,7 +51,7 @@ than on the triangle, as a share of the Gaussian's largest standard deviation.
 SHORTEST = 5
 """Edge length of triangles that are not divided further, in standard deviations of the Gaussians."""
 
-MIN_OPACITY = 0.5
+SURFACE_OPACITY = 0.5
 """Opacity above which Gaussians form the surface."""
 
 
@@ -173,7 +173,7 @@ def material_triangles(mesh: trimesh.Trimesh, splats: Splats | None) -> Triangle
     """
     if splats is None or splats.materials is None:
         return None
-    opaque = splats.opacities > MIN_OPACITY
+    opaque = splats.opacities > SURFACE_OPACITY
     parameters = splats.materials.metallic, splats.materials.roughness, splats.materials.specular
     kinds, kind = np.unique(np.round(np.stack(parameters)[:, opaque] * KINDS), axis=1, return_inverse=True)
     if kinds.shape[1] < 2:
@@ -211,7 +211,7 @@ def corner_materials(mesh: trimesh.Trimesh, splats: Splats | None) -> Float32Arr
     if triangles is not None:
         corners, facing = triangles.interpolate(corners), facing[triangles.face]
     count = 3 * len(corners)
-    opaque = np.flatnonzero(splats.opacities > MIN_OPACITY) if splats is not None else np.zeros(0, int)
+    opaque = np.flatnonzero(splats.opacities > SURFACE_OPACITY) if splats is not None else np.zeros(0, int)
     if splats is None or not len(opaque):
         return np.repeat(_BLACK, count, axis=0)
     rows = np.repeat(_BLACK, len(opaque), axis=0)

@@ -20,6 +20,7 @@ from mitsplat.gaussians.spherical_harmonics import SH_C0, sh_basis
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.rigid import transform_points
 from mitsplat.images.colour import decode_srgb, encode_srgb
+from mitsplat.renderer.materials.proxy_materials import SURFACE_OPACITY
 from mitsplat.renderer.projection.gaussian import srgb_to_linear
 from mitsplat.renderer.projection.splat_appearance import SplatAppearance, changed_colours
 from mitsplat.renderer.rays.device_arrays import wrapped
@@ -50,14 +51,14 @@ class RadianceGrid:
     def build(
         cls, splats: Splats, world_from_splats: Float64Array, appearance: SplatAppearance | None = None
     ) -> RadianceGrid | None:
-        """Build the grid from the splats with opacity above 0.5; return None if there are none.
+        """Build the grid from the splats that form surfaces; return None if there are none.
 
         Args:
             splats: The surroundings in their own frame.
             world_from_splats: Similarity transform, shape (4, 4).
             appearance: Change of their colours, or None.
         """
-        opaque = splats.opacities > 0.5
+        opaque = splats.opacities > SURFACE_OPACITY
         if not opaque.any():
             return None
         points = transform_points(world_from_splats, splats.means[opaque])

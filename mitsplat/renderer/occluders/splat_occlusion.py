@@ -26,7 +26,7 @@ from mitsplat.renderer.rays.device_arrays import ray_scene, wrapped
 SETS = 8
 """Number of sets of solids. A Gaussian of opacity a is in about a * SETS of them."""
 
-MIN_OPACITY = 0.01
+MIN_OCCLUDING_OPACITY = 0.01
 """Opacity below which a Gaussian stops no ray, and smallest u_i."""
 
 FOOTPRINT = 2.0
@@ -93,7 +93,7 @@ class Solids:
         corners, faces, owners, count = [], [], [], 0
         footprints = np.zeros(len(casters))
         for row, caster in enumerate(casters):
-            kept = np.flatnonzero(caster.splats.opacities > MIN_OPACITY)
+            kept = np.flatnonzero(caster.splats.opacities > MIN_OCCLUDING_OPACITY)
             if not len(kept):
                 continue
             splats = caster.splats.select(kept)
@@ -207,7 +207,7 @@ def _radii(opacities: Float64Array, sets: int, rng: np.random.Generator) -> Floa
     The u_i of a Gaussian are stratified over the sets, in a random order per Gaussian.
     """
     order = np.argsort(rng.random((sets, len(opacities))), axis=0)
-    u = np.maximum((order + rng.random(order.shape)) / sets, MIN_OPACITY)
+    u = np.maximum((order + rng.random(order.shape)) / sets, MIN_OCCLUDING_OPACITY)
     return np.sqrt(2 * np.log(np.maximum(opacities / u, 1)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -73,13 +74,11 @@ class OpenCVCamera(mi.Sensor):
         except ValueError:
             raise InputError(f"sensor 'opencv_camera': 'distortion' must be numbers (got {text!r})") from None
         self.lens = given.choice("lens", "opencv", "fisheye")
-        self.thin_lens = given.number("aperture_radius", 0.0), given.positive("focus_distance", 1.0)
-        self.m_needs_sample_3 = self.thin_lens[0] > 0
-        intrinsics = self.fx, self.fy, self.cx, self.cy
+        self.aperture_radius = given.number("aperture_radius", 0.0)
+        self.focus_distance = given.positive("focus_distance", 1.0)
+        self.m_needs_sample_3 = self.aperture_radius > 0
         try:
-            Camera(
-                int(width), int(height), *intrinsics, np.eye(4), self.distortion, self.near, self.lens, *self.thin_lens
-            )
+            Camera(world_from_camera=np.eye(4), **self._optics)
         except ValueError as error:
             raise InputError(f"sensor 'opencv_camera': {error}") from None
 
@@ -103,15 +102,16 @@ class OpenCVCamera(mi.Sensor):
         if self.to_world is not None:
             self._place(self.to_world)
 
-    def view(self, samples: int = 1) -> CameraView:
-        """Return the camera of the splat renderer."""
+    @property
+    def _optics(self) -> dict[str, Any]:
+        """All values of the camera except its pose, by the names that :class:`Camera` and :class:`CameraView` share."""
         width, height = (int(n) for n in self.film().size())
-        flip = np.diag([-1.0, -1.0, 1.0, 1.0])
-        pose = self.world_from_mitsuba @ flip
-        intrinsics = self.fx, self.fy, self.cx, self.cy
-        return CameraView(
-            width, height, *intrinsics, pose, self.distortion, self.near, samples, self.lens, *self.thin_lens
-        )
+        names = "fx", "fy", "cx", "cy", "distortion", "near", "lens", "aperture_radius", "focus_distance"
+        return {"width": width, "height": height} | {name: getattr(self, name) for name in names}
+
+    def view(self) -> CameraView:
+        """Return the camera of the splat renderer."""
+        return CameraView(world_from_camera=self.world_from_mitsuba @ np.diag([-1.0, -1.0, 1.0, 1.0]), **self._optics)
 
     def sample_ray(  # noqa: D102 - Mitsuba's interface
         self, time: mi.Float, wavelength: mi.Float, position: mi.Point2f, aperture: mi.Point2f, active: mi.Bool = True
@@ -123,7 +123,7 @@ class OpenCVCamera(mi.Sensor):
         matrix = mi.Matrix4f(self.world_from_mitsuba.tolist())
         dr.make_opaque(matrix)  # another pose reuses the compiled kernels
         to_world = mi.Transform4f(matrix)
-        radius, focus = self.thin_lens
+        radius, focus = self.aperture_radius, self.focus_distance
         point = radius * mi.warp.square_to_uniform_disk_concentric(aperture) if radius else mi.Point2f(0)
         ray.o = to_world @ mi.Point3f(point.x, point.y, 0)
         ray.d = dr.normalize(to_world @ mi.Vector3f(-u - point.x / focus, -v - point.y / focus, 1))

@@ -126,15 +126,15 @@ class LayerRenderer:
             shown = shown.with_luminance(luminance)
             mesh = shown.diffuse & shown.front
             seen = VisiblePixels(
-                rays.d,
-                shown.cover,
-                dr.select(mesh, meshes.depth, splat.depth) if meshes else splat.depth,
-                dr.select(mesh, 0, splat.instance),
-                contents.traits.seen(self._shape_votes(contents, view, z_max), splat.instance),
-                mesh,
-                metallic,
-                roughness,
-                self._shading_normals(contents, view, hit, splat, z_max),
+                direction=rays.d,
+                cover=shown.cover,
+                depth=dr.select(mesh, meshes.depth, splat.depth) if meshes else splat.depth,
+                instance=dr.select(mesh, 0, splat.instance),
+                trait=contents.traits.seen(self._shape_votes(contents, view, z_max), splat.instance),
+                mesh=mesh,
+                metallic=metallic,
+                roughness=roughness,
+                normal=self._shading_normals(contents, view, hit, splat, z_max),
             )
             # Visible meshes receive light like static proxies, also where splats touch them.
             ground = meshes.before(static) if meshes else static

@@ -96,17 +96,17 @@ class ContentsReader:
         if meshes is not None and meshes.diffuse is not None:
             mirror = SplatMirror.build(clouds, placements, distinct, [c.relit for c in carriers])
         self._contents = SceneContents(
-            ShapeState.of(shapes),
-            clouds,
-            placements,
-            Proxies(occluders, [s for s in visible if not is_transmissive(s.bsdf())], casters),
-            meshes,
-            mirror,
-            Traits.of(carriers, placements),
-            self._surroundings(carriers),
-            MixedObjects.of(carriers, placements),
-            NormalMappedShapes.of(carriers, placements),
-            trained_kernel(splats.kernel for splats in distinct),
+            state=ShapeState.of(shapes),
+            clouds=clouds,
+            placements=placements,
+            proxies=Proxies(occluders, [s for s in visible if not is_transmissive(s.bsdf())], casters),
+            meshes=meshes,
+            mirror=mirror,
+            traits=Traits.of(carriers, placements),
+            grid=self._surroundings(carriers),
+            mixed=MixedObjects.of(carriers, placements),
+            normal_mapped=NormalMappedShapes.of(carriers, placements),
+            kernel=trained_kernel(splats.kernel for splats in distinct),
         )
         return self._contents
 

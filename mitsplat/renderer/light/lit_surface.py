@@ -82,19 +82,21 @@ class LitSurface:
 
 @dataclass(frozen=True, eq=False)
 class VisiblePixels:
-    """Primary visibility of pixels.
+    """Visible surfaces of pixels that receive light: splats and purely diffuse meshes.
 
     Attributes:
         direction: Ray direction.
-        alpha, depth, instance: Opacity, depth and instance id as in the layers.
+        cover: Opacity of these surfaces.
+        depth: Depth along z [m] of the surface that the pixel shows.
+        instance: Instance id of this surface; 0 for a mesh.
         trait: Row of the visible shape in :class:`Traits`.
-        mesh: True if the pixel shows a visible mesh.
+        mesh: True if the pixel shows a purely diffuse mesh.
         metallic, roughness: Parameters that replace those of the proxy where they are not negative.
         normal: Unit shading normal that replaces that of the proxy where it is not zero.
     """
 
     direction: mi.Vector3f
-    alpha: mi.Float
+    cover: mi.Float
     depth: mi.Float
     instance: mi.UInt32
     trait: mi.UInt32
@@ -199,7 +201,7 @@ class VisibleSurfaces:
         quarter = dr.opaque(mi.Float, 0.25 / self.view.fx)  # of a pixel, at a depth of 1
         z = dr.select(raised, z * (1 - quarter), z)  # before the object instead of inside it
         position = ray(z / cosine)
-        valid = (seen.alpha > 1 / 255) & (z > 0)
+        valid = (seen.cover > 1 / 255) & (z > 0)
         traits, trait = self.traits, seen.trait
         captured = dr.gather(mi.Bool, traits.captured, trait)
         roughness, metallic, specular = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -130,17 +130,7 @@ class CameraView:
     @property
     def camera(self) -> Camera:
         """The same camera on the host, with one ray per pixel."""
-        return Camera(
-            self.width,
-            self.height,
-            *(self.fx, self.fy, self.cx, self.cy),
-            self.world_from_camera,
-            self.distortion,
-            self.near,
-            self.lens,
-            self.aperture_radius,
-            self.focus_distance,
-        )
+        return Camera(**{f.name: getattr(self, f.name) for f in fields(Camera)})
 
     def apertures(self, rings: int) -> list[CameraView]:
         """Return views through evenly spaced points of the aperture: the centre and ``rings`` hexagonal rings.

@@ -11,6 +11,7 @@ import numpy as np
 
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import SIMILAR, rigid_matrix
 from mitsplat.plugins.parameters import Parameters
 from mitsplat.renderer.rays.camera_rays import CameraView
 
@@ -85,9 +86,10 @@ class OpenCVCamera(mi.Sensor):
     def _place(self, to_world: mi.AffineTransform4f) -> None:
         """Set the pose."""
         pose = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4)
-        if np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() > 1e-4:
-            raise InputError("sensor 'opencv_camera': 'to_world' must be a rotation and a translation")
-        self.world_from_mitsuba = pose
+        try:
+            self.world_from_mitsuba = rigid_matrix(pose, "to_world", tolerance=SIMILAR)
+        except ValueError as error:
+            raise InputError(f"sensor 'opencv_camera': 'to_world' {error}") from None
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Offer ``to_world`` to ``mi.traverse``, besides the parameters of all sensors."""

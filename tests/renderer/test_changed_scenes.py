@@ -158,8 +158,23 @@ def test_the_camera_plugin_can_be_moved() -> None:
     truth = np.array(make_integrator(shadow_samples=4).render(scene, sensor_at(end)))
     np.testing.assert_allclose(np.array(integrator.render(scene, sensor)), truth, atol=1e-5)
     parameters["to_world"] = mi.Transform4f(end) @ mi.Transform4f().scale(2)
-    with pytest.raises(InputError, match=r"^sensor 'opencv_camera': 'to_world' must be a rotation and a translation$"):
+    with pytest.raises(InputError, match=r"^sensor 'opencv_camera': 'to_world' must be a rotation and a translation, "):
         parameters.update()
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (np.diag([-1.0, 1.0, 1.0, 1.0]), "must be a rotation and a translation, without scale or mirror"),
+        (np.full((4, 4), np.nan), "must be a finite 4x4 matrix to_world"),
+    ],
+)
+def test_a_camera_with_an_impossible_pose_is_refused(change: np.ndarray, sentence: str) -> None:
+    ensure_variant()
+    film = {"type": "hdrfilm", "width": 24, "height": 16}
+    camera = {"type": "opencv_camera", "fx": 25.0, "fy": 25.0, "to_world": mi.ScalarTransform4f(change), "film": film}
+    with pytest.raises((InputError, RuntimeError), match=f"sensor 'opencv_camera': 'to_world' {sentence}"):
+        mi.load_dict(camera)
 
 
 def test_a_transform_that_deforms_moved_splats_is_refused() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +22,16 @@ class _Columns:
 
     CORNER, ACROSS, UP, NORMAL, RADIANCE = (slice(start, start + 3) for start in range(0, 15, 3))
     WIDTH = 16
+
+
+class _Rectangle(NamedTuple):
+    """One rectangle per lane, with the values of :class:`_Columns`."""
+
+    corner: mi.Vector3f
+    across: mi.Vector3f
+    up: mi.Vector3f
+    normal: mi.Vector3f
+    radiance: mi.Color3f
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +69,18 @@ class Rectangles:
             rows[i, _Columns.RADIANCE] = np.array(light["radiance.value"]).ravel()
         return cls(wrapped(mi.Float, rows))
 
+    def _at(self, index: mi.UInt32, lanes: int, active: mi.Bool = True) -> _Rectangle:
+        """Return the rectangles ``index`` of as many lanes."""
+        row = dr.gather(mi.ArrayXf, self.rows, index, active, shape=(_Columns.WIDTH, lanes))
+        columns = _Columns.CORNER, _Columns.ACROSS, _Columns.UP, _Columns.NORMAL
+        corner, across, up, normal = (mi.Vector3f(*row[column]) for column in columns)
+        return _Rectangle(corner, across, up, normal, mi.Color3f(*row[_Columns.RADIANCE]))
+
     def towards(
         self, place: mi.Point3f, index: mi.UInt32, point: mi.Point2f
     ) -> tuple[mi.Vector3f, mi.Float, mi.Color3f, mi.Float]:
         """Return unit vectors and distances [m] to points of rectangles, radiance over density, and density [1/sr]."""
-        row = dr.gather(mi.ArrayXf, self.rows, index, shape=(_Columns.WIDTH, dr.width(index)))
-        columns = _Columns.CORNER, _Columns.ACROSS, _Columns.UP, _Columns.NORMAL
-        corner, across, up, normal = (mi.Vector3f(*row[column]) for column in columns)
+        corner, across, up, normal, radiance = self._at(index, dr.width(index))
         way = corner + across * point.x + up * point.y - mi.Vector3f(place)
         inverse = dr.rsqrt(dr.squared_norm(way))
         direction = way * inverse
@@ -72,7 +88,7 @@ class Rectangles:
         return (
             direction,
             dr.rcp(inverse),
-            mi.Color3f(*row[_Columns.RADIANCE]) * seen,
+            radiance * seen,
             dr.select(seen > 0, dr.rcp(seen), 0),
         )
 
@@ -88,9 +104,7 @@ class Rectangles:
         count, lanes = dr.opaque(mi.UInt32, dr.width(self.rows) // _Columns.WIDTH), dr.width(place)
 
         def add(i: mi.UInt32, total: mi.Color3f) -> tuple[mi.UInt32, mi.Color3f]:
-            row = dr.gather(mi.ArrayXf, self.rows, i, active, shape=(_Columns.WIDTH, lanes))
-            columns = _Columns.CORNER, _Columns.ACROSS, _Columns.UP, _Columns.NORMAL
-            corner, across, up, luminous = (mi.Vector3f(*row[column]) for column in columns)
+            corner, across, up, luminous, radiance = self._at(i, lanes, active)
             start = corner - mi.Vector3f(place)
             lit = active & (dr.dot(start, luminous) < 0)
             swept, sets, rises = mi.Float(0), mi.Vector3f(0), mi.Vector3f(0)
@@ -105,7 +119,7 @@ class Rectangles:
                 rises = dr.select((height <= 0) & (end > 0), low, rises)
                 start = start + edge
             swept += _swept(sets, rises - sets, rises, normal)
-            return i + 1, total + dr.select(lit, mi.Color3f(*row[_Columns.RADIANCE]) * (dr.abs(swept) / 2), 0)
+            return i + 1, total + dr.select(lit, radiance * (dr.abs(swept) / 2), 0)
 
         state = dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Color3f, lanes)
         return dr.while_loop(state, lambda i, _: active & (i < count), add, label="light of rectangles")[1]
@@ -123,9 +137,7 @@ class Rectangles:
         def nearest(
             i: mi.UInt32, number: mi.UInt32, distance: mi.Float, radiance: mi.Color3f, density: mi.Float
         ) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Color3f, mi.Float]:
-            row = dr.gather(mi.ArrayXf, self.rows, i, shape=(_Columns.WIDTH, lanes))
-            columns = _Columns.CORNER, _Columns.ACROSS, _Columns.UP, _Columns.NORMAL
-            corner, across, up, normal = (mi.Vector3f(*row[column]) for column in columns)
+            corner, across, up, normal, emitted = self._at(i, lanes)
             facing = -dr.dot(direction, normal)
             reach = dr.dot(origin - corner, normal) / facing
             point = origin + direction * reach - corner
@@ -135,7 +147,7 @@ class Rectangles:
                 i + 1,
                 dr.select(inside, i, number),
                 dr.select(inside, reach, distance),
-                dr.select(inside, mi.Color3f(*row[_Columns.RADIANCE]), radiance),
+                dr.select(inside, emitted, radiance),
                 dr.select(inside, dr.square(reach) / facing, density),
             )
 

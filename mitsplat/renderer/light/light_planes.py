@@ -17,7 +17,7 @@ import mitsuba as mi
 from mitsplat.renderer.emitters.emitter_sampling import Emitters
 from mitsplat.renderer.light.error_target import share_variance
 from mitsplat.renderer.light.light_estimate import Estimate
-from mitsplat.renderer.light.light_tiles import BLOCK
+from mitsplat.renderer.light.light_tiles import BLOCK, grid_size, tile_of_pixels
 from mitsplat.renderer.light.lit_surface import LitSurface, VisibleSurfaces
 from mitsplat.renderer.light.shadow_rays import ShadowTracer
 from mitsplat.renderer.rays.camera_rays import CameraView
@@ -85,7 +85,7 @@ class Planes:
 
         The code must also hold in the adjacent row below and in the adjacent column to the right.
         """
-        across, down = -(-view.width // BLOCK), -(-view.height // BLOCK)
+        across, down = grid_size(view)
         tile = dr.arange(mi.UInt32, across * down)
         x, y = tile % across * BLOCK, tile // across * BLOCK
         codes = dr.select(needed, codes | _NEEDED, codes)
@@ -121,7 +121,8 @@ class Planes:
 
     def samples(self) -> mi.UInt32:
         """Return the traced pixels, ordered by their place in the tile and then by tile."""
-        i, count, across = dr.arange(mi.UInt32, SAMPLES * self.count), dr.opaque(mi.UInt32, self.count), self._across
+        i, count = dr.arange(mi.UInt32, SAMPLES * self.count), dr.opaque(mi.UInt32, self.count)
+        across, _ = grid_size(self.view)
         within = i // count
         tile = dr.gather(mi.UInt32, self.number, i - within * count)
         x, y = tile % across * BLOCK + within % (BLOCK // 2) * 2, tile // across * BLOCK + within // (BLOCK // 2) * 2
@@ -155,25 +156,19 @@ class Planes:
         by_tile = dr.full(mi.Bool, False, dr.width(self.place))
         dr.scatter(by_tile, even, self.number)
         dr.eval(by_tile)
-        pixel = dr.arange(mi.UInt32, self.view.width * self.view.height)
-        tile = pixel // self.view.width // BLOCK * self._across + pixel % self.view.width // BLOCK
-        return dr.gather(mi.Bool, by_tile, tile)
+        return dr.gather(mi.Bool, by_tile, tile_of_pixels(self.view))
 
     def _neighbours(self) -> Iterator[mi.UInt32]:
         """Yield the places of the eight neighbours of each tile, and of the tile itself.
 
         Coordinates are clamped to the image.
         """
-        x, y = mi.Int32(self.number % self._across), mi.Int32(self.number // self._across)
-        down = -(-self.view.height // BLOCK)
+        across, down = grid_size(self.view)
+        x, y = mi.Int32(self.number % across), mi.Int32(self.number // across)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
-                nx, ny = dr.clip(x + dx, 0, self._across - 1), dr.clip(y + dy, 0, down - 1)
-                yield dr.gather(mi.UInt32, self.place, mi.UInt32(ny * self._across + nx))
-
-    @property
-    def _across(self) -> int:
-        return -(-self.view.width // BLOCK)
+                nx, ny = dr.clip(x + dx, 0, across - 1), dr.clip(y + dy, 0, down - 1)
+                yield dr.gather(mi.UInt32, self.place, mi.UInt32(ny * across + nx))
 
 
 @dataclass(frozen=True, eq=False)

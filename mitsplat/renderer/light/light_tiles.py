@@ -40,6 +40,17 @@ def block_order(view: CameraView) -> tuple[mi.UInt32, mi.Bool]:
     return dr.select(inside, y * view.width + x, 0), inside
 
 
+def grid_size(view: CameraView) -> tuple[int, int]:
+    """Return the number of tiles of BLOCK x BLOCK pixels along each axis of an image."""
+    return -(-view.width // BLOCK), -(-view.height // BLOCK)
+
+
+def tile_of_pixels(view: CameraView) -> mi.UInt32:
+    """Return the number of the tile of every pixel; tiles are numbered row by row."""
+    pixel = dr.arange(mi.UInt32, view.width * view.height)
+    return pixel // view.width // BLOCK * grid_size(view)[0] + pixel % view.width // BLOCK
+
+
 def parity(block_x: mi.UInt32, block_y: mi.UInt32) -> mi.UInt32:
     """Return the index (0 to 3) of a block in its group of 2 x 2 blocks."""
     return (block_x & 1) | (block_y & 1) << 1
@@ -74,7 +85,7 @@ class ShadowTiles:
             lost: Light (Color3f) that dynamic objects occlude, in the same order.
             view: Camera.
         """
-        width, height = -(-view.width // BLOCK), -(-view.height // BLOCK)
+        width, height = grid_size(view)
         squares_x = -(-view.width // BLOCK**2)
         tile = dr.arange(mi.UInt32, width * height)
         x, y = tile % width, tile // width
@@ -116,13 +127,12 @@ class ShadowTiles:
 
     def differs(self, error: float) -> mi.Bool:
         """Return for each pixel (Bool) if dynamic objects occlude at least the share ``error``, or one place in it."""
-        pixel = dr.arange(mi.UInt32, self.view.width * self.view.height)
-        tile = pixel // self.view.width // BLOCK * -(-self.view.width // BLOCK) + pixel % self.view.width // BLOCK
-        return dr.gather(mi.Bool, self.concentrated | (self.mean_occluded >= dr.opaque(mi.Float, error)), tile)
+        differs = self.concentrated | (self.mean_occluded >= dr.opaque(mi.Float, error))
+        return dr.gather(mi.Bool, differs, tile_of_pixels(self.view))
 
     def light(self) -> mi.Color3f:
         """Return the remaining share of light (Color3f) at every pixel, interpolated between tile centres."""
-        width, height = -(-self.view.width // BLOCK), -(-self.view.height // BLOCK)
+        width, height = grid_size(self.view)
         pixel = dr.arange(mi.UInt32, self.view.width * self.view.height)
         x = (mi.Float(pixel % self.view.width) + 0.5) / BLOCK - 0.5
         y = (mi.Float(pixel // self.view.width) + 0.5) / BLOCK - 0.5

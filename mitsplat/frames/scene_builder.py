@@ -108,8 +108,8 @@ class SceneBuilder:
         for placed in placed_shapes(scene, layout):
             name, shape = f"shape_{placed.number}", placed.shape
             if shape.visible:
-                material = surroundings.material_of(shape)
-                shapes[name] = self._visible_shape(name, shape, placed.stated, material, belt, placed.motion)
+                finish = surroundings.material_of(shape)
+                shapes[name] = self._visible_shape(name, shape, placed.stated, finish, belt, placed.motion)
             elif shape.proxy:
                 make = partial(make_splats_shape, NO_SPLATS, proxy=placed.mesh)
                 shapes[name] = self._reuse(name, placed.motion.tobytes(), make)

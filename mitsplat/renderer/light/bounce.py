@@ -96,7 +96,7 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
     less of this mean counts there (Ward et al. 1988, "A Ray Tracing Solution for Diffuse Interreflection").
     """
     surface, pixel = tracer.surface, tracer.pixel
-    thing, count = surface.instance > 0, dr.width(pixel)
+    on_object, count = surface.instance > 0, dr.width(pixel)
     captured = mi.Bool(False)
     if cover is not None:
         shaded = dr.sum(estimate.lit) < MAX_SHARE * dr.sum(estimate.base)
@@ -105,9 +105,9 @@ def trace_bounce(tracer: ShadowTracer, reflectors: Reflectors, estimate: Estimat
     with_objects, static = dr.zeros(mi.Color3f, count), dr.zeros(mi.Color3f, count)
     known = dr.zeros(mi.Float, count)
     for which, trace in (
-        (surface.relit & thing & surface.diffuse, _trace_objects),
+        (surface.relit & on_object & surface.diffuse, _trace_objects),
         (captured & selected, _trace_surroundings),
-        (surface.relit & ~thing & selected, _trace_meshes),
+        (surface.relit & ~on_object & selected, _trace_meshes),
     ):
         places = dr.compress(which)
         if dr.width(places):

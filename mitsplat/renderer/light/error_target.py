@@ -37,8 +37,8 @@ def share_variance(share: mi.Float, draws: mi.Float) -> mi.Float:
     return likely * (1 - likely) / draws
 
 
-def metered_exposure(light: mi.Float, area: mi.Int32, others: mi.UInt32) -> mi.Float:
-    """Return the exposure factor that makes the mean of a picture look like ``MID_GREY``.
+def exposure_factor(light: mi.Float, area: mi.Int32, others: mi.UInt32) -> mi.Float:
+    """Return the factor of an automatic exposure, which makes the mean of a picture look like ``MID_GREY``.
 
     Each value of ``light`` represents ``area`` pixels. The ``others`` count as 1.
     """

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mitsplat.renderer.light.error_target import allowed_error, metered_exposure, share_variance
+from mitsplat.renderer.light.error_target import allowed_error, exposure_factor, share_variance
 from mitsplat.renderer.light.light_estimate import Estimate, LightMeans
 from mitsplat.renderer.light.lit_surface import LitSurface
 from mitsplat.renderer.rays.camera_rays import CameraView
@@ -150,7 +150,7 @@ class LightFilter:
         share, variance, shared = self._share(estimate)
         light, exposure = unshadowed * share, mi.Float(1)
         if others is not None:
-            exposure = metered_exposure(light, self.stride * self.stride, others)
+            exposure = exposure_factor(light, self.stride * self.stride, others)
         error = allowed_error(error, light * exposure)
         return estimate.rays * variance * dr.square(unshadowed * exposure / error) / _gain(shared), exposure
 

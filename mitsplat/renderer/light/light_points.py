@@ -199,12 +199,12 @@ def filtered_roughness(here: LitSurface, index: mi.UInt32, place: mi.UInt32, vie
 
 def _bends(here: LitSurface, index: mi.UInt32, place: mi.UInt32, view: CameraView) -> mi.Bool:
     """Return for each pixel (Bool) if it borders on another shape or, on an instance, on another surface direction."""
-    thing, bends = here.instance > 0, mi.Bool(False)
+    on_object, bends = here.instance > 0, mi.Bool(False)
     for dx, dy in np.ndindex(3, 3):
         inside, other, lit = _neighbour(index, place, view, (dx - 1, dy - 1))
         same = dr.gather(mi.Float, here.trait, other, lit) == here.trait
         even = dr.dot(dr.gather(mi.Vector3f, here.normal, other, lit), here.normal) > EVEN
-        bends |= (lit & ~same) | (inside & thing & ~(lit & even))
+        bends |= (lit & ~same) | (inside & on_object & ~(lit & even))
     bends &= here.known & here.valid
     dr.eval(bends)
     return bends

@@ -149,13 +149,13 @@ class VisibleSurfaces:
         own = dr.compress((instance > 0) & (self.hit.instance != instance))
         if not dr.width(own):
             return nearest
-        thing, found, done = dr.gather(mi.UInt32, instance, own), mi.UInt32(own), mi.Bool(False)
+        shown, found, done = dr.gather(mi.UInt32, instance, own), mi.UInt32(own), mi.Bool(False)
         column, row = mi.Int32(own % width), mi.Int32(own // width)
         for dx, dy in _AROUND:
             x, y = column + dx, row + dy
             inside = (x >= 0) & (x < width) & (y >= 0) & (y < height) & ~done
             other = mi.UInt32(y * width + x)
-            hits = inside & (dr.gather(mi.UInt32, self.hit.instance, other, inside) == thing)
+            hits = inside & (dr.gather(mi.UInt32, self.hit.instance, other, inside) == shown)
             found, done = dr.select(hits, other, found), done | hits
         dr.scatter(nearest, found, own, mode=dr.ReduceMode.Permute)
         dr.eval(nearest)

@@ -30,7 +30,8 @@ def light_properties(scene: Scene, layout: int = 0) -> MitsubaDict:
     return {
         "shadow": "none" if composite.shadow == "none" else "traced",
         "shadow_error": composite.shadow_error,
-        # The image-space shadow only evaluates light relative to the brightest value.
+        # The exposure of a camera is assumed to suit the light, as an automatic exposure does. The image-space shadow
+        # only evaluates light relative to the brightest value.
         "metered": composite.exposure != "fixed" or composite.shadow == "image",
         "occluders": composite.occluders,
         "bounce": composite.bounce,

@@ -27,6 +27,14 @@ lattices (Niederreiter 1992, section 5.3).
 SMALL_LATTICES = ((2, 1), (3, 2), (5, 3), (8, 5), (13, 8), (21, 13))
 """Lattices of each emitter, if several share the points of one lattice."""
 
+MAX_SHARING = 7
+"""Number of emitters beyond which their lattices do not become smaller."""
+
+ROUNDING = 4 / 3
+"""Factor by which the points of an emitter are divided before they are rounded up to one of :data:`SMALL_LATTICES`. Two
+to seven emitters then share 26 to 40 points for a lattice of 34.
+"""
+
 UNIFORM_SHARE = 0.1
 """Share of the rays that is divided equally among all emitters, independent of their light at the reference point."""
 
@@ -239,7 +247,7 @@ class Emitters:
         if self.rectangles is not None:
             total = self.rectangles.irradiance(si.p, mi.Vector3f(si.sh_frame.n), active)
         elif len(self.local):
-            least = lattice[0] / min(7, 4 / 3 * len(self.local))
+            least = lattice[0] / min(MAX_SHARING, ROUNDING * len(self.local))
             number, generator = next((small for small in SMALL_LATTICES if small[0] >= least), lattice)
             i = np.arange(number)
             # Tables are faster than divisions in the loop, and do not change the kernel with the number of lamps.

@@ -180,10 +180,12 @@ class LightPoints:
 def filtered_roughness(here: LitSurface, index: mi.UInt32, place: mi.UInt32, view: CameraView) -> mi.Float:
     """Return the roughness of the lobe of a whole pixel, whose normals vary on a curved surface.
 
-    A pixel has the variance 1/4 px^2. With the difference d of the normals of adjacent pixels, alpha'^2 = alpha^2 +
-    2 mean(d^2) / 4 (Tokuyoshi and Kaplanyan 2019, "Improved Geometric Specular Antialiasing"). Sharp edges do not
-    count: bent pixels have several points. The change decreases with the squared cosine to the camera, because a wide
-    lobe at a silhouette would lose light below the surface.
+    The filter is a Gaussian of variance 1/4 px^2 (Tokuyoshi and Kaplanyan 2019, "Improved Geometric Specular
+    Antialiasing"). With the difference d of the normals of adjacent pixels, the normals have the variance mean(d^2) / 4
+    per axis, a mean over both axes of the image. The slopes of Beckmann's microfacets have the variance alpha^2 / 2 per
+    axis, so that alpha'^2 = alpha^2 + 2 mean(d^2) / 4. The cited paper takes the sum over both axes, an upper bound.
+    Sharp edges do not count: bent pixels have several points. The change decreases with the squared cosine to the
+    camera, because a wide lobe at a silhouette would lose light below the surface.
     """
     total, count = mi.Float(0), mi.Float(0)
     for step in ((1, 0), (-1, 0), (0, 1), (0, -1)):

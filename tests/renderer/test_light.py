@@ -150,6 +150,20 @@ def test_uniform_capture_keeps_its_colour_under_the_irradiance_of_white(unit: fl
     assert light.mean() == pytest.approx(1.0, abs=5e-3)
 
 
+@pytest.mark.parametrize("others", [0, 1])
+def test_a_lamp_at_the_reference_point_casts_shadows(others: int) -> None:
+    """Its light there is infinite, where lamps are compared to distribute the rays among them."""
+    make_integrator()
+    lid = trimesh.creation.box(bounds=[[-0.2, -0.2, -0.21], [0.2, 0.2, -0.2]])
+    shapes = {
+        "floor": make_splats_shape(floor(1.0, z=-0.5), proxy=slab(1.0, -0.5)),
+        "lid": make_splats_shape(nothing(), proxy=lid, instance=1),
+        "lamp": {"type": "point", "position": [0, 0, 0], "intensity": 1.0},
+        **{f"lamp_{i}": {"type": "point", "position": [0, 0, 0.1], "intensity": 1.0} for i in range(others)},
+    }
+    assert not render(shapes, down_camera(), reference=[0, 0, 0], bounce=False).light.any()
+
+
 def test_side_away_from_the_light_is_darker() -> None:
     make_integrator()
     ball = trimesh.creation.icosphere(4, 0.3)

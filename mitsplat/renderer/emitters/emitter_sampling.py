@@ -129,12 +129,17 @@ class Emitters:
         self._index_of = wrapped(mi.UInt32, index_of)
 
     def _survey(self, count: int, point: mi.Point3f) -> Float64Array:
-        """Return the fluence (count,) of each emitter at a point, sum over channels [W/m^2]."""
+        """Return the fluence (count,) of each emitter at a point, sum over channels [W/m^2].
+
+        That of a lamp at the point itself is infinite, and replaced by that of all others together.
+        """
         i = dr.arange(mi.UInt32, count * SURVEY_LATTICE[0])
         emitter = dr.gather(mi.EmitterPtr, self.pointers, i // SURVEY_LATTICE[0])
         sample = lattice_point(i % SURVEY_LATTICE[0], SURVEY_LATTICE)
         _, radiance = emitter.sample_direction(receiver(point, mi.Normal3f(0, 0, 1)), sample, True)
-        return np.array(dr.sum(radiance)).reshape(count, -1).mean(axis=1)
+        fluence = np.array(dr.sum(radiance)).reshape(count, -1).mean(axis=1)
+        finite = np.isfinite(fluence)
+        return np.where(finite, fluence, fluence[finite].sum() or 1.0)
 
     def sample(self, si: mi.SurfaceInteraction3f, point: mi.Point2f, active: mi.Bool) -> Beam:
         """Sample one random direction from ``si`` for each point of the unit square."""

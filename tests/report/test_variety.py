@@ -7,15 +7,17 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from pycocotools import mask as coco_mask
 from scipy.spatial.transform import Rotation
 
+from mitsplat.formats.coco import image_file
 from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.pages.svg_charts import discs
 from mitsplat.report import variety
-from mitsplat.report.dataset_report import write_report
+from mitsplat.report.dataset_report import _FRACTIONS, _Statistics, write_report
 from mitsplat.report.variety import MIN_VIEWS, RINGS, SECTORS, Variety, cell_of
 from tests.cli.typed import run
 from tests.manifests import records_of, store
@@ -101,6 +103,47 @@ def test_occlusion_counts_agree_with_masks(clean: Path) -> None:
     page = write_report(clean, clean.parent / "variety.html")[0].read_text()
     found = numbers(page, "Most frequent pairs of occluder and occluded class")
     assert {name: int(count) for name, count in found.items()} == expected
+
+
+def test_charts_of_labels_and_brightness_agree_with_the_files(clean: Path) -> None:
+    """Counts are recomputed one by one from the manifest and the pictures."""
+    records = records_of(clean)
+    labels = [label for one in records for label in one["labels"]["instances"]]
+    page = write_report(clean, clean.parent / "charts.html")[0].read_text()
+
+    def counts(caption: str) -> dict[str, int]:
+        return {name: int(count) for name, count in numbers(page, caption).items() if int(count)}
+
+    assert counts("Instances by class") == Counter(label["class"] for label in labels)
+    assert counts("Instances per image") == Counter(str(len(one["labels"]["instances"])) for one in records)
+    for caption, key in (
+        ("Visible fraction of instances", "visible_fraction"),
+        ("Truncation of instances", "truncation"),
+        ("Agreement of splats and proxies", "agreement"),
+        ("Agreement of their boundaries", "boundary_f1"),
+    ):
+        bins = Counter(min(int(20 * label[key]), 19) for label in labels)
+        assert counts(caption) == {f"{i / 20:.3g} to {(i + 1) / 20:.3g}": count for i, count in bins.items()}, caption
+    greys = [cv2.imread(str(clean / image_file(one)), cv2.IMREAD_GRAYSCALE) for one in records]
+    pixels = Counter(int(value) // 8 for grey in greys for value in grey.ravel())
+    assert counts("Brightness of pixels") == {f"{8 * i} to {8 * i + 7}": count for i, count in pixels.items()}
+    means = Counter(int(grey.mean() / 12.75) for grey in greys)
+    shown = {f"{12.75 * i:.3g} to {12.75 * (i + 1):.3g}": count for i, count in means.items()}
+    assert counts("Brightness of images") == shown
+
+
+def test_maps_of_boxes_count_centres_and_sizes() -> None:
+    """Cells have 1/24 of the width of the image and about the same height."""
+    statistics = _Statistics((480, 240))
+    boxes = [(20, 40, 100, 60), (21, 41, 101, 61), (460, 200, 480, 240)]
+    entries = [{"box": box, "class": "nut", **dict.fromkeys(_FRACTIONS, 1.0)} for box in boxes]
+    statistics.add({"split": "train", "labels": {"instances": entries}})
+    places, sizes = np.zeros((12, 24)), np.zeros((12, 24))
+    for x0, y0, x1, y1 in boxes:
+        places[int((y0 + y1) / 2 / 20), int((x0 + x1) / 2 / 20)] += 1
+        sizes[(y1 - y0) // 20, (x1 - x0) // 20] += 1
+    np.testing.assert_array_equal(statistics.places._counts, places)
+    np.testing.assert_array_equal(statistics.sizes._counts, sizes)
 
 
 def test_every_draw_has_its_histogram() -> None:

@@ -505,7 +505,9 @@ class TestMaps:
             np.testing.assert_array_equal(pixels["instance"], frame.instance)
             np.testing.assert_array_equal(pixels["Z"], frame.depth)
 
-    @pytest.mark.parametrize(("farthest", "scale"), [(6.5, 0.1), (6.6, 1.0), (70.0, 10.0), (9e9, 100.0)])
+    @pytest.mark.parametrize(
+        ("farthest", "scale"), [(6.5534, 0.1), (6.5536, 1.0), (65.534, 1.0), (65.536, 10.0), (9e9, 100.0)]
+    )
     def test_the_depth_scale_fits_the_largest_depth(self, farthest: float, scale: float) -> None:
         depth = np.array([[0.0, 0.00001, farthest]])
         assert maps.depth_scale(depth) == scale

@@ -38,6 +38,7 @@ PLAIN = [f"{number}.jpg" for number in range(3)]
         ("photos", ["\u00fc.png"], ["u\u0308.png"], {"\u00fc.png": "u\u0308.png"}),
         ("photos", ["a.png", "a.jpg"], ["a.jpg", "a.png"], {"a.png": "a.png", "a.jpg": "a.jpg"}),
         ("photos", ["frame.0001"], ["frame.0001.png", "frame.0002.png"], {"frame.0001": "frame.0001.png"}),
+        ("photos", ["frame.0001"], ["frame.png", "frame.0001.png"], {"frame.0001": "frame.0001.png"}),
         ("photos", ["0.jpg"], ["0.jpg", "thumbnails/0.jpg"], {"0.jpg": "0.jpg"}),
         ("photos", ["other.jpg"], ["a.jpg"], {}),
     ],

@@ -78,6 +78,16 @@ def test_an_image_with_two_lenses_is_refused(tmp_path: Path) -> None:
         read_transforms(path, parse_transforms(path), {})
 
 
+def test_a_fourth_coefficient_without_a_fisheye_lens_is_refused(tmp_path: Path) -> None:
+    """OpenCV's fourth radial coefficient belongs to another model than the first three."""
+    path = write(tmp_path, transforms(k1=0.1, k4=0.01, camera_model="OPENCV"))
+    with pytest.raises(InputError, match=r"frames\[0\]: k4 belongs to camera_model OPENCV_FISHEYE \(got OPENCV\)"):
+        read_transforms(path, parse_transforms(path), {})
+    path = write(tmp_path, transforms(k1=0.1, k4=0.01, camera_model="OPENCV_FISHEYE"))
+    model, _ = read_transforms(path, parse_transforms(path), {})
+    assert model.cameras["a.png"].distortion == (0.1, 0.0, 0.0, 0.01)
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [

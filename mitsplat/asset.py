@@ -33,6 +33,7 @@ from mitsplat.arrays import Float32Array, Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
+from mitsplat.geometry.mesh import is_closed
 from mitsplat.geometry.mesh_normals import state_normals, stated_normals
 from mitsplat.geometry.rigid import homogeneous_matrix, scaling, transform_points
 from mitsplat.mesh_files.mesh_reading import read_mesh, read_proxy
@@ -338,8 +339,8 @@ class Asset:
         if self.mesh is None:
             return ()
         findings = []
-        if not self.mesh.is_watertight:
-            findings.append("the mesh is not watertight: mass and inertia come from its convex pieces")
+        if not is_closed(self.mesh):
+            findings.append("the mesh is not closed: mass and inertia come from its convex pieces")
         size = float(self.mesh.extents.max())
         bounds = {"pieces": [piece.bounds for piece in self.pieces]}
         core = opaque_core(self.splats)

@@ -272,7 +272,7 @@ class TestCheck:
         )
         assert "bounds of pieces and mesh" in replace(asset, pieces=asset.pieces[:1]).check()[0]
         open_mesh = trimesh.Trimesh(asset.mesh.vertices, asset.mesh.faces[1:])
-        assert "not watertight" in replace(asset, mesh=open_mesh).check()[0]
+        assert "not closed" in replace(asset, mesh=open_mesh).check()[0]
 
 
 class TestBadInput:

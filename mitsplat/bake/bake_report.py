@@ -11,7 +11,7 @@ from mitsplat.bake.bake import BakeResult
 from mitsplat.bake.size_checks import describe_size
 from mitsplat.bake.verification import BakedView
 from mitsplat.geometry.decomposition import max_gap
-from mitsplat.geometry.mesh import mass_properties
+from mitsplat.geometry.mesh import is_closed, mass_properties
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
 from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report_page
 
@@ -40,7 +40,7 @@ def _figures(result: BakeResult) -> str:
     }
     if asset.mesh is not None:
         rows["Size"] = describe_size(asset.mesh)
-        rows["Mesh"] = f"{len(asset.mesh.faces)} faces, {'watertight' if asset.mesh.is_watertight else 'open'}"
+        rows["Mesh"] = f"{len(asset.mesh.faces)} faces, {'closed' if is_closed(asset.mesh) else 'open'}"
         if asset.pieces:
             mass = mass_properties(asset.mesh, asset.pieces, density=asset.density, mass=asset.mass)
             rows["Mass"] = f"{mass.mass:.4g} kg at {asset.density:.4g} kg/m^3"

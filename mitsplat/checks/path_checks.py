@@ -24,7 +24,7 @@ from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.formats.registry import Catalogue
 from mitsplat.geometry.coplanar import coplanar_place
-from mitsplat.geometry.mesh import closed_solid, mass_properties
+from mitsplat.geometry.mesh import closed_solid, is_closed, mass_properties
 from mitsplat.physics.settle import try_alone, warp_settings
 from mitsplat.reconstruct.registration import measure_offset
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
@@ -189,8 +189,8 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
         "register the mesh to the splats: `mitsplat mesh --import`",
     )  # fmt: skip
     yield Finding(
-        "watertightness", bool(mesh.is_watertight) or asset.kind == "environment",
-        "closed" if mesh.is_watertight else "open",
+        "watertightness", is_closed(mesh) or asset.kind == "environment",
+        "closed" if is_closed(mesh) else "open",
         "close it (`mitsplat mesh`, or a mesh editor); otherwise mass and inertia are those of its convex pieces",
     )  # fmt: skip
     if asset.kind == "object":

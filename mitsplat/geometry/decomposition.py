@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.hull_fit import fit_to_hull
-from mitsplat.geometry.mesh import SHARP, contact_points, simplify_solid
+from mitsplat.geometry.mesh import SHARP, contact_points, is_closed, separate_solids, simplify_solid
 from mitsplat.geometry.mesh_distance import DistanceSurface, max_outside_distance
 from mitsplat.geometry.mesh_holes import close_holes
 from mitsplat.storage.cache import cache_folder, write_cache_file
@@ -34,6 +34,8 @@ _GAP_LIMIT, _GAP_SHARE_OF_SMALL, _GAP_SHARE_OF_LARGE = 1e-3, 0.1, 0.005
 _THRESHOLD = 0.02
 # A solid that fills this share of its hull is replaced by the hull. The difference is below the resolution of physics.
 _CONVEX = 0.9995
+# Minimum volume of a part, as a share of the cube of the diagonal.
+_MIN_VOLUME = 1e-12
 # More parts than this are debris of a scan, which is decomposed as a whole.
 _MAX_PARTS = 64
 # A mesh with more faces is a scan. Its noise is removed first, by this share of its size and at most by this distance
@@ -90,7 +92,7 @@ def convex_pieces(
 @lru_cache(maxsize=256)
 def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, max_pieces: int) -> tuple[trimesh.Trimesh, ...]:
     libraries = f"{version('coacd')} {version('manifold3d')}"  # of meshes with few faces, and of scans
-    digest = ContentHash("pieces 8", f"{libraries} {threshold!r} {max_pieces}", vertices, faces)
+    digest = ContentHash("pieces 9", f"{libraries} {threshold!r} {max_pieces}", vertices, faces)
     path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:
@@ -105,9 +107,10 @@ def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, max_pieces: 
 def _parts(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
     """Return the closed solids of a mesh, without cavities; or the mesh itself if it is open."""
     mesh = close_holes(mesh)  # scans lack a few triangles
-    if not mesh.is_watertight:
+    if not mesh.is_watertight and not is_closed(mesh):
         return [mesh]
-    parts = [part for part in mesh.split(only_watertight=False) if part.volume > 0]
+    # Faces between solids that touch may form a surface without a volume.
+    parts = [part for part in separate_solids(mesh) if part.volume > _MIN_VOLUME * mesh.scale**3]
     return parts if 0 < len(parts) <= _MAX_PARTS else [mesh]
 
 

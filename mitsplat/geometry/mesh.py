@@ -86,7 +86,7 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
         welded = close_holes(welded)  # where slivers were removed
     # Divergence theorem: sum of the tetrahedra from the centre to each triangle. Holes matter least from there.
     volume = float(np.linalg.det(welded.triangles - mesh.bounds.mean(axis=0)).sum()) / 6
-    if volume < 0 and (solid or welded.is_watertight):  # an open scan has no inside
+    if volume < 0 and (solid or is_closed(welded)):  # an open scan has no inside
         _logger.warning("%s: the mesh is inside out; physics flips its faces", name)
         welded.invert()
     if solid and abs(volume) < 1e-6 * size**3:
@@ -94,7 +94,7 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
             f"{name}: the mesh must enclose a volume (got {abs(volume):.3g} m^3 at {size:g} m across): "
             "is it open or flat?"
         )
-    if solid and not welded.is_watertight:
+    if solid and not is_closed(welded):
         _logger.warning("%s: the mesh is not closed; mass and inertia are those of its convex pieces", name)
     if len(welded.faces) > _MAX_FACES:
         _logger.warning("%s: physics simplifies the mesh of %d to %d triangles", name, len(welded.faces), _MAX_FACES)
@@ -105,7 +105,7 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
 def mass_properties(
     mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh], *, density: float, mass: float | None = None
 ) -> MassProperties:
-    """Integrate a uniform density over a mesh, or over its convex pieces if the mesh is not watertight.
+    """Integrate a uniform density over a mesh, or over its convex pieces if the mesh is not closed.
 
     Args:
         mesh: Surface of the object [m].
@@ -124,7 +124,28 @@ def mass_properties(
 
 def closed_solid(mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Return the mesh if it is closed, else its joined convex pieces."""
-    return mesh if mesh.is_watertight and mesh.is_winding_consistent else join_meshes(pieces)
+    return mesh if is_closed(mesh) else join_meshes(pieces)
+
+
+def is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Return True if the faces enclose solids: they pass each edge equally often in both directions.
+
+    Four faces share an edge where solids touch, or where a coarse solid touches itself. ``is_watertight`` of trimesh
+    is then False, although the volume is defined. Faces that are listed twice would count their solid twice, and both
+    sides of a sheet without thickness enclose nothing: such meshes are not closed.
+    """
+    if mesh.is_watertight:
+        return bool(mesh.is_winding_consistent)
+    directions = np.where(mesh.edges[:, 0] < mesh.edges[:, 1], 1, -1)
+    edges, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
+    if np.bincount(edge.ravel(), directions, len(edges)).any():
+        return False
+    corners = np.sort(mesh.faces, axis=1)
+    turns = np.sign(np.linalg.det(np.eye(3)[np.argsort(mesh.faces, axis=1)]))  # the direction of equal corners
+    if len(np.unique(np.column_stack([corners, turns]), axis=0)) < len(corners):
+        return False
+    one, other = mesh.face_adjacency.T  # the faces of edges that two faces share
+    return not (corners[one] == corners[other]).all(axis=1).any()
 
 
 def join_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
@@ -153,6 +174,17 @@ def solid_manifold(solid: trimesh.Trimesh) -> manifold3d.Manifold:
     # Manifold refuses subclasses of NumPy arrays whose rows are not contiguous. Reordered faces are such arrays.
     vertices = np.ascontiguousarray(solid.vertices, np.float32)
     return manifold3d.Manifold(manifold3d.Mesh(vertices, np.ascontiguousarray(solid.faces, np.uint32)))
+
+
+def separate_solids(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Return the connected surfaces of a closed mesh, each of which has two faces at every edge.
+
+    Surfaces of negative volume are cavities.
+    """
+    if mesh.is_watertight:
+        return list(mesh.split(only_watertight=False))
+    surfaces = [solid.to_mesh() for solid in solid_manifold(mesh).decompose()]
+    return [trimesh.Trimesh(found.vert_properties[:, :3], found.tri_verts, process=False) for found in surfaces]
 
 
 def simplify_solid(solid: trimesh.Trimesh, tolerance: float) -> trimesh.Trimesh:

@@ -58,6 +58,18 @@ def test_separate_parts_are_split_apart():
     assert len(convex_pieces(apart)) == 2
 
 
+@pytest.mark.parametrize("place", [(0.05, 0.04, 0), (0, 0, 0.03)], ids=["edge", "face"])
+def test_parts_that_touch_are_split_apart(place: tuple[float, float, float]) -> None:
+    box = trimesh.creation.box((0.05, 0.04, 0.03))
+    other = box.copy().apply_translation(place)
+    joint = trimesh.Trimesh(*trimesh.util.append_faces([box.vertices, other.vertices], [box.faces, other.faces]))
+    assert not joint.is_watertight
+    pieces = convex_pieces(joint)
+    bounds = np.array([piece.bounds for piece in pieces])
+    np.testing.assert_allclose([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)], joint.bounds, atol=1e-6)
+    assert sum(piece.volume for piece in pieces) == pytest.approx(2 * box.volume, rel=1e-5)
+
+
 def test_pieces_are_cached_and_damaged_cache_files_replaced(cache, bracket, caplog):
     shifted = bracket.copy().apply_translation((0.001, 0, 0))  # not in the cache
     first = convex_pieces(shifted)

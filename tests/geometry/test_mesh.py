@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from mitsplat.errors import InputError
-from mitsplat.geometry.mesh import contact_points, mass_properties, prepare_mesh
+from mitsplat.geometry.mesh import contact_points, is_closed, mass_properties, prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface
 
 
@@ -129,3 +129,44 @@ def test_contact_points_are_dense_along_edges():
     assert (at_edge >= 2).all()
     along = np.sort(points[np.linalg.norm(points[:, :2] - 0.01, axis=1) < 1e-9, 2])
     np.testing.assert_allclose(np.diff(along), 0.0005)
+
+
+def _touching(case: str) -> trimesh.Trimesh:
+    """Closed solids of one mesh whose equal vertices are merged, so that four faces share an edge."""
+    box = trimesh.creation.box((0.05, 0.04, 0.03))
+    other = box.copy()
+    match case:
+        case "edge":
+            other.apply_translation((0.05, 0.04, 0))
+        case "face":
+            other.apply_translation((0, 0, 0.03))
+        case "lid":  # a ring and a disc on it, with other triangles on the faces where they touch
+            box = trimesh.creation.annulus(0.018, 0.02, 0.008)
+            other = trimesh.creation.cylinder(0.02, 0.0015, sections=32)
+            other.apply_translation((0, 0, 0.00475))
+    return trimesh.Trimesh(*trimesh.util.append_faces([box.vertices, other.vertices], [box.faces, other.faces]))
+
+
+@pytest.mark.parametrize("case", ["edge", "face", "lid"])
+def test_solids_that_touch_are_closed(case: str, caplog: pytest.LogCaptureFixture) -> None:
+    mesh = _touching(case)
+    assert not mesh.is_watertight
+    assert is_closed(mesh)
+    prepared = prepare_mesh(mesh, case)
+    assert not caplog.records
+    found = mass_properties(prepared, (), density=1000.0)
+    assert found.mass == pytest.approx(1000.0 * mesh.volume)
+    np.testing.assert_allclose(found.centre, mesh.center_mass, atol=1e-9)
+
+
+def test_faces_listed_twice_turned_or_without_thickness_are_not_closed() -> None:
+    box = trimesh.creation.box((0.05, 0.04, 0.03))
+    assert is_closed(box)
+    twice = trimesh.Trimesh(box.vertices, np.concatenate([box.faces, np.roll(box.faces, 1, axis=1)]), process=False)
+    turned = trimesh.Trimesh(box.vertices, np.concatenate([box.faces[:6], box.faces[6:, ::-1]]), process=False)
+    corners = np.concatenate([box.vertices, [[0.1, 0, 0]]])
+    first, second = box.edges_unique[0]
+    fin = np.array([[first, second, 8], [second, first, 8]])  # both sides of a sheet on an edge of the box
+    finned = trimesh.Trimesh(corners, np.concatenate([box.faces, fin]), process=False)
+    for mesh in (twice, turned, finned):
+        assert not is_closed(mesh)

@@ -10,7 +10,7 @@ import shapely
 import trimesh
 
 from mitsplat.bake.mesh_parts import MeshPart
-from mitsplat.geometry.mesh import simplify_solid
+from mitsplat.geometry.mesh import is_closed, simplify_solid
 from mitsplat.geometry.mesh_holes import close_holes
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 
@@ -60,17 +60,28 @@ def _merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _simplify(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
-    """Simplify a solid to at most about ``most`` faces.
+    """Simplify a solid to at most about ``most`` faces, or to more faces if only those form a closed surface.
 
     Quadric decimation may tear meshes such as scans; Manifold simplifies those instead.
     """
     if len(solid.faces) <= most:
         return solid
-    fewer = solid.simplify_quadric_decimation(face_count=most)
+    fewer = _without_folds(solid.simplify_quadric_decimation(face_count=most))
     if fewer.is_volume:
         return fewer
-    closed = (simplify_solid(solid, tolerance) for tolerance in _TOLERANCES * solid.scale)
-    return next((mesh for mesh in closed if len(mesh.faces) <= most), fewer)
+    fewest = solid
+    for tolerance in _TOLERANCES * solid.scale:
+        fewest = min(fewest, simplify_solid(solid, tolerance), key=lambda mesh: len(mesh.faces))
+        if len(fewest.faces) <= most:
+            return fewest
+    return fewer if is_closed(fewer) else fewest
+
+
+def _without_folds(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Remove pairs of faces with the same corners, into which decimation collapses thin features."""
+    corners = np.sort(mesh.faces, axis=1)
+    _, group, counts = np.unique(corners, axis=0, return_inverse=True, return_counts=True)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[counts[group.ravel()] != 2], process=False)
 
 
 def _close_solid(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -8,6 +8,7 @@ import trimesh
 
 from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.bake.proxy_mesh import make_proxy
+from mitsplat.geometry.mesh import is_closed
 from mitsplat.geometry.mesh_distance import DistanceSurface
 
 
@@ -25,6 +26,27 @@ def test_the_proxy_of_a_scan_with_many_faces_is_watertight() -> None:
     assert proxy.is_volume
     assert 1000 < len(proxy.faces) <= 4000
     assert np.abs(DistanceSurface(scan).signed_distances(proxy.sample(2000, seed=0))).max() < 0.01 * scan.scale
+
+
+def _knurled(edge: float) -> trimesh.Trimesh:
+    """A knurled knob of 41 mm with edges of at most ``edge`` [mm]."""
+    mesh = trimesh.creation.cylinder(20, 30, sections=64).subdivide_to_size(edge)
+    mesh.merge_vertices()
+    x, y, z = mesh.vertices.T
+    knurls = np.clip((np.hypot(x, y) - 18) / 2, 0, 1) * np.cos(40 * np.arctan2(y, x)) * np.cos(1.5 * z)
+    factors = np.stack([1 + 0.02 * knurls, 1 + 0.02 * knurls, np.ones_like(z)], axis=1)
+    return trimesh.Trimesh(1e-3 * factors * mesh.vertices, mesh.faces, process=False)
+
+
+@pytest.mark.parametrize("most", [1000, 2000])
+def test_the_proxy_of_a_knurled_knob_is_closed(most: int) -> None:
+    """Quadric decimation tears the knurls, and other simplifications need more faces."""
+    knob = _knurled(1.6)
+    assert knob.is_volume and not knob.simplify_quadric_decimation(face_count=most).is_volume
+    proxy = make_proxy([part(knob)], most)
+    assert is_closed(proxy)
+    assert proxy.volume == pytest.approx(knob.volume, rel=0.02)
+    assert len(proxy.faces) < 3000
 
 
 @pytest.mark.parametrize("turn", [(-np.pi / 2, 0, 0), (0.3, -0.7, 1.1)])

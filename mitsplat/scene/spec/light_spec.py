@@ -171,7 +171,9 @@ class SpotLight(AimedLight):
     """Point that emits light into a cone."""
 
     kind: Literal["spot"] = Field("spot", description="Spot light.")
-    cone: ConeAngle = Field(30.0, description="Half angle of the cone [degrees].")
+    cone: ConeAngle = Field(
+        30.0, description="Half angle of the cone [degrees]. The intensity falls linearly in its outer quarter."
+    )
     intensity: Positive = Field(10.0, description="Radiant intensity [W/sr].")
 
 

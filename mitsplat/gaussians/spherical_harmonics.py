@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsplat.arrays import AnyArray, Float32Array, Float64Array
+from mitsplat.geometry.camera_poses import spiral
 from mitsplat.images.colour import encode_srgb
 
 SH_C0 = 0.28209479177387814
@@ -104,11 +105,8 @@ def sh_rotation(rotation: npt.ArrayLike, degree: int) -> Float64Array:
     Returns:
         Matrix D of shape (K, K), K = (degree + 1)^2; the new coefficients are ``D @ sh``.
     """
-    # Fibonacci sphere: 64 directions determine 16 functions with a condition number near 1.
-    index = np.arange(64) + 0.5
-    azimuth, z = index * np.pi * (1.0 + np.sqrt(5.0)), 1.0 - index / 32.0
-    radius = np.sqrt(1.0 - z * z)
-    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
+    # 64 directions determine 16 functions with a condition number near 1.
+    directions = spiral(1.0 - 2.0 * (np.arange(64) + 0.5) / 64)
     turned = sh_basis(directions @ np.asarray(rotation, dtype=np.float64), degree)
     solution = np.linalg.pinv(sh_basis(directions, degree)) @ turned
     return np.asarray(solution, dtype=np.float64)

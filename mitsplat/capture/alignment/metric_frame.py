@@ -19,6 +19,7 @@ from mitsplat.capture.boards.targets import Board
 from mitsplat.capture.capture import parse_pixel
 from mitsplat.capture.structure_from_motion import SparseModel
 from mitsplat.errors import InputError
+from mitsplat.geometry.camera_poses import spiral
 from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.geometry.triangulation import count_observers, nearest_point_to_lines, optical_axes
 
@@ -238,10 +239,7 @@ def vertical_from_cameras(model: SparseModel) -> Float64Array | None:
     """
     poses = np.array([camera.world_from_camera[:3, :3] for camera in model.cameras.values()])
     sides = poses[:, :, :2]
-    golden = np.arange(1000) + 0.5  # even samples of a half sphere (Fibonacci)
-    height, angle = golden / 1000, np.pi * (1 + np.sqrt(5)) * golden
-    radius = np.sqrt(1 - height**2)
-    directions = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
+    directions = spiral((np.arange(1000) + 0.5) / 1000)  # even samples of a half sphere
     tilt = np.mean(np.min((directions @ sides) ** 2, axis=2), axis=0)
     best = int(tilt.argmin())
     upward = directions[best]

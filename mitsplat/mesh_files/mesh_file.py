@@ -215,12 +215,12 @@ def alpha_of(image: Image.Image) -> npt.NDArray[np.uint8]:
 
 
 def is_transparent(image: Image.Image) -> bool:
-    """Return True if an image has transparent pixels."""
-    try:
-        alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
-        return alpha is not None and float(np.asarray(alpha).min()) < 250
-    except IMAGE_ERRORS as error:
-        raise InputError(f"its texture cannot be read ({error})") from error
+    """Return True if an image has transparent pixels.
+
+    Raises:
+        InputError: If the image is damaged.
+    """
+    return image.has_transparency_data and bool(alpha_of(image).min() < 250)
 
 
 WITHOUT_COORDINATES = "its texture has no coordinates, and is left out"

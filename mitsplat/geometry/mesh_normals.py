@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -109,18 +110,25 @@ def stated_normals(mesh: trimesh.Trimesh) -> Float64Array | None:
     return np.asarray(normals / np.linalg.norm(normals, axis=2, keepdims=True))
 
 
+def ply_faces(mesh: trimesh.Trimesh) -> dict[str, Any]:
+    """Return the face properties of the PLY file from which trimesh read a mesh, by their names."""
+    face = mesh.metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    if isinstance(face, dict):  # of text files
+        return face
+    columns = {name: face[name] for name in getattr(getattr(face, "dtype", None), "names", None) or ()}
+    return {name: stored["f1"] if stored.dtype.names else stored for name, stored in columns.items()}
+
+
 def read_stated_normals(mesh: trimesh.Trimesh) -> None:
     """Give a mesh the stated normals of the PLY file from which trimesh read it, if it has any.
 
     Raises:
         ValueError: If they are not finite vectors of length 1 for all corners.
     """
-    face = mesh.metadata.get("_ply_raw", {}).get("face", {}).get("data")
-    names = face if isinstance(face, dict) else getattr(getattr(face, "dtype", None), "names", None) or ()
-    if _STATED not in names:
+    stored = ply_faces(mesh).get(_STATED)
+    if stored is None:
         return
-    stored = np.asarray(face[_STATED])  # of text files, or a record of each list
-    local = np.asarray(stored["f1"] if stored.dtype.names else stored, dtype=np.float32)
+    local = np.asarray(stored, dtype=np.float32)
     if local.shape != (len(mesh.faces), 9) or not np.allclose((local.reshape(-1, 3) ** 2).sum(axis=1), 1, atol=1e-2):
         raise ValueError(f"{_STATED} must be three vectors of length 1 for each face")
     mesh.face_attributes[_STATED] = local

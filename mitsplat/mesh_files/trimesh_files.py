@@ -16,6 +16,7 @@ from trimesh.resolvers import FilePathResolver
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.geometry.mesh_normals import ply_faces
 from mitsplat.images.colour import decode_srgb
 from mitsplat.mesh_files.collada_files import (
     check_collada,
@@ -135,13 +136,12 @@ def _stated_normals(scene: trimesh.Scene) -> dict[str, Float64Array]:
 def _textured_ply_normals(mesh: trimesh.Trimesh) -> Float64Array | None:
     """Return the normals (V, 3) of a PLY file at the vertices of a mesh with its triangles, or None without any."""
     elements = mesh.metadata["_ply_raw"]
-    vertex, face = elements["vertex"]["data"], elements["face"]["data"]
+    vertex = elements["vertex"]["data"]
     if not {"nx", "ny", "nz"} <= set(elements["vertex"]["properties"]):
         return None
     (name,) = {"vertex_index", "vertex_indices"} & set(elements["face"]["properties"])
-    polygons = face[name] if isinstance(face, dict) else face[name]["f1"]
     rows = np.zeros(len(mesh.vertices), dtype=np.int64)
-    rows[mesh.faces] = trimesh.geometry.triangulate_quads(polygons)
+    rows[mesh.faces] = trimesh.geometry.triangulate_quads(ply_faces(mesh)[name])
     return np.column_stack([np.ravel(vertex[axis]) for axis in ("nx", "ny", "nz")]).astype(np.float64)[rows]
 
 
@@ -349,14 +349,12 @@ def _polygons(
     kind = path.suffix.lower()
     if kind == ".ply":
         for mesh in scene.geometry.values():
-            raw = mesh.metadata.get("_ply_raw", {})
-            vertex, face = (raw.get(name, {}).get("data") for name in ("vertex", "face"))
-            names = face if isinstance(face, dict) else getattr(getattr(face, "dtype", None), "names", None) or ()
-            for name in {"vertex_index", "vertex_indices"} & set(names):
-                polygons = face[name] if isinstance(face, dict) else face[name]["f1"]
-                if "red" in names and any(len(one) != 3 for one in polygons):
+            face = ply_faces(mesh)
+            for name in {"vertex_index", "vertex_indices"} & set(face):
+                if "red" in face and any(len(one) != 3 for one in face[name]):
                     raise InputError("faces with colours must be triangles: export it with triangles")
-                yield np.column_stack([np.ravel(vertex[axis]) for axis in "xyz"]).astype(np.float64), polygons
+                vertex = mesh.metadata["_ply_raw"]["vertex"]["data"]
+                yield np.column_stack([np.ravel(vertex[axis]) for axis in "xyz"]).astype(np.float64), face[name]
     elif kind == ".off":
         _, rows, count, number = _off_rows(path)
         faces = [row[1 : int(row[0]) + 1] for row in rows[count + 1 : count + number + 1]]

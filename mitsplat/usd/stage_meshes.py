@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.errors import InputError
+from mitsplat.mesh_files.face_polygons import split_polygons
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -50,7 +50,7 @@ def triangles_of(prim: Usd.Prim, time: Usd.TimeCode) -> Triangles | None:
 
 
 def _mesh_triangles(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> Triangles | None:
-    """Return vertices and triangles of a polygon mesh; polygons are split into fans."""
+    """Return vertices and triangles of a polygon mesh."""
     points, counts, corners = (
         np.array(attribute.Get(time) if attribute.Get(time) is not None else ())
         for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
@@ -67,16 +67,13 @@ def _mesh_triangles(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> Triangles | None:
         raise InputError(
             f"{path}: faceVertexIndices must be 0 to {len(points) - 1} (got {corners.min()} to {corners.max()})"
         )
-    faces = np.concatenate(list(_fans(counts.astype(np.int64), corners.astype(np.int64))))
+    points = points.astype(np.float64)
+    if (counts == 3).all():
+        faces = corners.reshape(-1, 3)
+    else:
+        polygons = np.split(corners, np.cumsum(counts)[:-1])
+        triangles = split_polygons(points, polygons)
+        faces = np.concatenate([one[rows] for one, rows in zip(polygons, triangles, strict=True)])
     if mesh.GetOrientationAttr().Get() == "leftHanded":
         faces = faces[:, ::-1]
-    return points.astype(np.float64), np.ascontiguousarray(faces)
-
-
-def _fans(counts: Int64Array, corners: Int64Array) -> Iterator[Int64Array]:
-    """Yield the triangles (N, 3) of all polygons with equal numbers of corners."""
-    starts = np.cumsum(counts) - counts
-    for size in np.unique(counts):
-        first = starts[counts == size]
-        for corner in range(1, size - 1):
-            yield corners[np.stack([first, first + corner, first + corner + 1], axis=1)]
+    return points, np.ascontiguousarray(faces, dtype=np.int64)

@@ -21,6 +21,7 @@ from mitsplat.renderer.scene_emitters import emitter_dict
 from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
+from mitsplat.usd.stage_meshes import triangles_of
 from mitsplat.usd.stage_scene import read_stage_scene
 from tests.cli.typed import run
 from tests.manifests import records_of
@@ -443,6 +444,21 @@ def test_images_of_the_sky_that_are_not_read_are_named(tmp_path: Path) -> None:
     stage.Save()
     with pytest.raises(InputError, match=r"balls\.usda: the image \./broken\.exr of /World/dome: .* not a readable"):
         read_stage_scene(tmp_path / "in/balls.usda", tmp_path / "scene")
+
+
+def test_the_triangles_of_a_concave_polygon_cover_it_once(tmp_path: Path) -> None:
+    """The stage has an L, whose fan overlaps itself, and a square."""
+    stage = new_stage(tmp_path / "shapes.usda")
+    mesh = UsdGeom.Mesh.Define(stage, "/World/shapes")
+    corners = [(2, 0), (2, 1), (1, 1), (1, 2), (0, 2), (0, 0), (3, 0), (4, 0), (4, 1), (3, 1)]
+    mesh.CreatePointsAttr([(x, y, 0) for x, y in corners])
+    mesh.CreateFaceVertexCountsAttr([6, 4])
+    mesh.CreateFaceVertexIndicesAttr(range(10))
+    found = triangles_of(mesh.GetPrim(), Usd.TimeCode.Default())
+    assert found is not None
+    a, b, c = np.moveaxis(found[0][found[1]], 1, 0)
+    areas = np.cross(b - a, c - a)[:, 2] / 2
+    assert areas.min() > 0 and areas.sum() == pytest.approx(3 + 1)
 
 
 def test_an_exported_frame_is_read_as_the_same_scene(folder: Path, tmp_path: Path) -> None:  # noqa: F811

@@ -312,6 +312,5 @@ def _place_mesh(
     if pose.kept:
         mesh.apply_transform(pose.motion)
         matrix = pose.motion @ alignment.splats_from_mesh
-        size = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-        alignment = Alignment(matrix, size, measure_offset(mesh, points).spread)
+        alignment = Alignment(matrix, measure_offset(mesh, points).spread)
     return mesh, alignment, pose

@@ -47,13 +47,16 @@ class Alignment:
 
     Attributes:
         splats_from_mesh: Similarity transform, shape (4, 4).
-        scale: Scale of the transform.
         residual: Median distance of the splats' surface from the moved mesh, as a share of its diagonal.
     """
 
     splats_from_mesh: Float64Array
-    scale: float
     residual: float
+
+    @property
+    def scale(self) -> float:
+        """Scale of the transform."""
+        return float(np.cbrt(np.linalg.det(self.splats_from_mesh[:3, :3])))
 
 
 @dataclass(frozen=True)
@@ -151,8 +154,7 @@ def register_mesh(mesh: trimesh.Trimesh, points: Float64Array, scale: float | No
     _, _, mesh_from_splats = min(finals)
     distance = surface.nearest(transform_points(mesh_from_splats, points))[2]
     splats_from_mesh = np.asarray(np.linalg.inv(mesh_from_splats), dtype=np.float64)
-    found_scale = float(np.cbrt(np.linalg.det(splats_from_mesh[:3, :3])))
-    return Alignment(splats_from_mesh, found_scale, float(np.median(distance) / mesh.scale))
+    return Alignment(splats_from_mesh, float(np.median(distance) / mesh.scale))
 
 
 def measure_offset(mesh: trimesh.Trimesh, points: Float64Array) -> Offset:

@@ -80,7 +80,7 @@ def read_stage_asset(path: Path) -> StageAsset:
     if any("motion" in record for record in (*fields, *records["bodies"])):
         notes.append("not imported: the motion of prims, which are read at the first time code")
     frame = body_frames(path, records["bodies"]).get(bodies.pop(), np.eye(4))
-    splats, found_notes = merge_fields(path, fields, _inverse(frame))
+    splats, found_notes = merge_fields(path, fields, frame)
     asset = make_stage_asset(path, records, fields[0]["body"], splats, notes)
     notes += found_notes
     for note in notes:
@@ -106,9 +106,10 @@ def rigid_frame(path: Path, record: Record) -> tuple[Float64Array, float]:
     return homogeneous_matrix(rotation, translation), scale
 
 
-def merge_fields(path: Path, fields: Sequence[Record], frame_from_world: Float64Array) -> tuple[Splats, list[str]]:
-    """Return the splats of particle fields in a frame, by its transform (4, 4), and notes on changed values."""
+def merge_fields(path: Path, fields: Sequence[Record], frame: Float64Array) -> tuple[Splats, list[str]]:
+    """Return the splats of particle fields in a frame of this pose (4, 4), and notes on changed values."""
     notes: list[str] = []
+    frame_from_world = np.linalg.inv(frame)
     parts = []
     for field in fields:
         try:
@@ -158,7 +159,7 @@ def make_stage_asset(path: Path, records: Record, body: str | None, splats: Spla
         notes: List to which notes are appended.
     """
     frames = body_frames(path, records["bodies"])
-    frame_from_world = _inverse(frames.get(body, np.eye(4)))
+    frame_from_world = np.asarray(np.linalg.inv(frames.get(body, np.eye(4))), dtype=np.float64)
     colliders = [one for one in records["colliders"] if one["body"] == body]
     proxies = [one for one in records["meshes"] if one["body"] == body and not one["visible"]]
     if not colliders and not proxies:
@@ -256,10 +257,6 @@ def _pieces(path: Path, record: Record, frame_from_world: Float64Array) -> Seque
         return [mesh.convex_hull]
     except (QhullError, ValueError):
         raise InputError(f"{path}: {record['path']}: a convex collider must span a volume") from None
-
-
-def _inverse(matrix: Float64Array) -> Float64Array:
-    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
 
 
 def with_values(

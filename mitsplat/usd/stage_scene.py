@@ -202,7 +202,7 @@ def _object(
     """Return the asset of a body, or of a labelled particle field without one."""
     body = fields[0]["body"]
     frame = rigid_frame(path, fields[0])[0] if body is None else frames[body]
-    splats, found = merge_fields(path, fields, np.asarray(np.linalg.inv(frame), dtype=np.float64))
+    splats, found = merge_fields(path, fields, frame)
     notes.extend(found)
     asset = None if body is None else make_stage_asset(path, records, body, splats, notes)
     if asset is None:

@@ -105,7 +105,6 @@ class PlacedSurface:
             return reach
         return min(reach, float(self.signed_distances(near).min()))
 
-    @quiet_warp()
     def signed_distances(self, points: Float64Array) -> Float32Array:
         """Return the distance of each world-space point (N, 3) [m] to the surface; negative inside."""
         return self._surface.signed_distances((points - self._pose[:3, 3]) @ self._pose[:3, :3])

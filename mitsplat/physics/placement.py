@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.geometry.mesh_distance import ROUNDING_ERROR, DistanceSurface, PlacedSurface, clearance
-from mitsplat.geometry.rigid import homogeneous_matrix
+from mitsplat.geometry.rigid import homogeneous_matrix, transform_points
 from mitsplat.scene.spec.object_spec import Arrangement
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import PILE_HEIGHT
@@ -389,7 +389,7 @@ class _Draw:
 
 def _bounds(outline: Float64Array, pose: Float64Array) -> Float64Array:
     """Compute the corners of the bounding box of points (N, 3) at a pose, shape (2, 3)."""
-    moved = outline @ pose[:3, :3].T + pose[:3, 3]
+    moved = transform_points(pose, outline)
     return np.stack([moved.min(axis=0), moved.max(axis=0)])
 
 

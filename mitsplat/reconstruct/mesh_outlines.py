@@ -78,8 +78,7 @@ class MeshOutlines:
 
     def _hits(self, camera: Camera, pixels: Float64Array) -> BoolArray:
         """Return True for pixel positions (N, 2) at which a camera sees the mesh."""
-        slopes = np.nan_to_num(camera.ray_slopes(pixels), nan=1e3)
-        ahead = np.column_stack([slopes, np.ones(len(slopes))]) @ camera.world_from_camera[:3, :3].T
+        ahead = np.nan_to_num(camera.rays(pixels), nan=1e3) @ camera.world_from_camera[:3, :3].T
         origin = mi.Point3f(*[dr.opaque(mi.Float, float(value)) for value in camera.centre])
         direction = mi.Vector3f(*[wrapped(mi.Float, axis.astype(np.float32)) for axis in ahead.T])
         return np.array(self._scene.ray_test(mi.Ray3f(origin, direction)))

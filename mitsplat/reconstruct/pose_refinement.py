@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.mesh_distance import DistanceSurface
-from mitsplat.geometry.rigid import homogeneous_matrix
+from mitsplat.geometry.rigid import homogeneous_matrix, transform_points
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.mesh_outlines import MaskBoundary, MeshOutlines, contours_of
 from mitsplat.reconstruct.segment_splats import MaskedView
@@ -175,7 +175,7 @@ def _turns(mesh: trimesh.Trimesh) -> list[Float64Array]:
     for axis in np.linalg.svd(points - middle, full_matrices=False)[2]:
         for angle in np.radians(np.arange(30, 360, 30)):
             turn = trimesh.transformations.rotation_matrix(angle, axis, middle)
-            distance = surface.nearest(points @ turn[:3, :3].T + turn[:3, 3])[2]
+            distance = surface.nearest(transform_points(turn, points))[2]
             if distance.mean() < _TURN_DISTANCE * mesh.scale:
                 found.append(np.asarray(turn))
     return found
@@ -225,8 +225,7 @@ class _Match:
         points = outlines.outline(view.camera.transformed(np.linalg.inv(frame.motion(pose))))
 
         def project(pose: Float64Array) -> Float64Array:
-            motion = frame.motion(pose)
-            return view.camera.project(points @ motion[:3, :3].T + motion[:3, 3])[0]
+            return view.camera.project(transform_points(frame.motion(pose), points))[0]
 
         start = project(pose)
         rows = np.flatnonzero(view.has_boundary(start))

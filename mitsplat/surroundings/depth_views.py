@@ -10,6 +10,7 @@ import numpy as np
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.renderer.layers import Layers, render_splats
 
 SIZE = 240
@@ -70,8 +71,7 @@ class SurfacePoints:
 
     def transformed(self, motion: Float64Array) -> SurfacePoints:
         """Return the points after a rigid motion (4, 4)."""
-        turn = motion[:3, :3].T
-        return SurfacePoints(self.places @ turn + motion[:3, 3], self.normals @ turn, self.central)
+        return SurfacePoints(transform_points(motion, self.places), self.normals @ motion[:3, :3].T, self.central)
 
 
 def depth_views(splats: Splats, cameras: Sequence[Camera], size: int = SIZE) -> list[DepthView]:

@@ -16,7 +16,7 @@ from benchmarks.scale.attack.__main__ import all_attacks
 from benchmarks.scale.attack.attack import SECRET_COLOUR, SECRET_WORD, Attack, judge
 from benchmarks.scale.attack.samples import Place, Samples
 from mitsplat.asset import Asset
-from mitsplat.bake.mesh_parts import read_parts
+from mitsplat.bake.mesh_parts import read_model
 from mitsplat.engine import scheduler
 from mitsplat.errors import InputError
 from mitsplat.frames import mitsuba_xml as xml_scene
@@ -451,9 +451,9 @@ class TestMeshes:
         ):
             load_scene(write_scene(scene_data))
         with pytest.raises(InputError, match="must be a mesh file, not an archive"):
-            read_parts(tmp_path / name)
+            read_model(tmp_path / name)
 
-    @pytest.mark.parametrize("read", [read_mesh, read_parts])
+    @pytest.mark.parametrize("read", [read_mesh, read_model])
     def test_a_count_of_vertices_without_data_is_refused(self, tmp_path, read):
         """The file states positions of 10^10 vertices without a buffer. By the glTF specification these are zeros."""
         accessor = {"componentType": 5126, "count": 10**10, "type": "VEC3"}

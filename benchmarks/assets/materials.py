@@ -38,7 +38,7 @@ from scipy.spatial import KDTree
 from benchmarks.light.shadow_scenes import ROOT, block, coverage, lights_of, pose, worn
 from benchmarks.light.shadows import psnr, save_sheet
 from benchmarks.record import figure, recording
-from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_model
 from mitsplat.bake.mesh_surface import MeshSurface
 from mitsplat.bake.part_shapes import bake_lights, mitsuba_scene, part_shape
 from mitsplat.capture.capture import Capture, Photo
@@ -70,12 +70,12 @@ MAIN_SHARE = 0.1
 def placed(name: str) -> tuple[MeshPart, ...]:
     """Return the true parts of the object on the mat."""
     scene = build_part(name, 0)[0].copy().apply_transform(pose(0, 0, 0, 20, TILTS.get(name, 0)))
-    return read_parts(scene.apply_translation((0, 0, -float(scene.bounds[0, 2]))))
+    return read_model(scene.apply_translation((0, 0, -float(scene.bounds[0, 2])))).parts
 
 
 def mat() -> tuple[MeshPart, ...]:
     image = m.cast((120, 122, 120), np.random.default_rng(4), size=256)
-    return read_parts(trimesh.Scene({"mat": worn(block((-0.4, -0.4, -0.03), (0.4, 0.4, 0)), image)}))
+    return read_model(trimesh.Scene({"mat": worn(block((-0.4, -0.4, -0.03), (0.4, 0.4, 0)), image)})).parts
 
 
 def balanced(name: str, folder: Path) -> tuple[LightSpec, ...]:

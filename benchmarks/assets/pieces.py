@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.assets.bake import cpu_seconds
 from benchmarks.record import figure, recording
-from mitsplat.bake.mesh_parts import read_parts
+from mitsplat.bake.mesh_parts import read_model
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.geometry.decomposition import convex_pieces, denoise_solid, max_gap
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
@@ -35,7 +35,7 @@ def main() -> None:
         rows = []
         for path in (names[0], *names):
             os.environ["XDG_CACHE_HOME"] = f"{cache}/{len(rows)}"
-            mesh = make_proxy(read_parts(path, metres_per_unit=1.0, up="z", finish=None), arguments.proxy_faces)
+            mesh = make_proxy(read_model(path, metres_per_unit=1.0, up="z", finish=None).parts, arguments.proxy_faces)
             mesh.vertices += 1e-9 * (not rows)  # a mesh other than the measured ones
             start = cpu_seconds()
             pieces = convex_pieces(mesh)

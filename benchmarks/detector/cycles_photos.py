@@ -44,7 +44,7 @@ from benchmarks.detector.clutter import STEEL, Material, matt, metal
 from benchmarks.detector.interiors import Interior, interior
 from benchmarks.detector.workshop import PLASTIC, WOOD, annotation, check_labels, settle_parts, write_labels
 from benchmarks.record import ROOT, recording
-from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_model
 from mitsplat.capture.lighting.panorama import unit_vector
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.mesh_normals import corner_normals
@@ -128,7 +128,7 @@ def photograph_benches(options: argparse.Namespace) -> None:
 def write_parts(inputs: Path, names: Iterable[str] = PARTS) -> None:
     """Write the meshes and the prints of parts."""
     for name in names:
-        for part in read_parts(unplaced(name).mesh):
+        for part in read_model(unplaced(name).mesh).parts:
             write_mesh(inputs / f"{name}-{part.name}.npz", part.mesh, None if part.texture is None else part.texture.uv)
             if is_printed(FINISHES[name][part.name]) and part.texture is not None:
                 Image.fromarray(np.asarray(part.texture.pixels, np.uint8)).save(inputs / f"{name}-{part.name}.png")

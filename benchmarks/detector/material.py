@@ -29,7 +29,7 @@ from scipy.cluster.vq import kmeans2
 from benchmarks.detector.packages import make_bag, make_package, relabel, shape_of
 from benchmarks.record import figure, recording
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.mesh_parts import read_parts
+from mitsplat.bake.mesh_parts import read_model
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.runtime.device import use_device
 
@@ -64,7 +64,7 @@ def share_cores(processes: int) -> None:
 
 def parts_hull(mesh: Path | trimesh.Trimesh, up: Literal["y", "z"]) -> trimesh.Trimesh:
     """Return the convex hull of all parts of a mesh [m], z up."""
-    parts = read_parts(mesh, metres_per_unit=1.0, up=up, finish=None)
+    parts = read_model(mesh, metres_per_unit=1.0, up=up, finish=None).parts
     return trimesh.util.concatenate([part.mesh for part in parts]).convex_hull
 
 

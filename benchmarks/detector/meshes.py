@@ -28,7 +28,7 @@ from scipy.spatial import KDTree
 from benchmarks.detector.experiment import write_scene
 from benchmarks.detector.material import wanted_assets
 from mitsplat.asset import Asset
-from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_model
 from mitsplat.bake.part_shapes import part_shape
 from mitsplat.frames.camera_response import develop
 from mitsplat.frames.frame import Frame
@@ -66,7 +66,7 @@ def main() -> None:
 def textured(hope: Path) -> dict[str, tuple[MeshPart, ...]]:
     """Return the source meshes of all assets, by name."""
     meshes = {one.name: one.mesh() for one in wanted_assets(hope)}
-    return {name: read_parts(mesh, up=up) for name, (mesh, up) in meshes.items()}
+    return {name: read_model(mesh, up=up).parts for name, (mesh, up) in meshes.items()}
 
 
 def frames(scene: Scene, parts: Mapping[str, tuple[MeshPart, ...]], indices: range, samples: int) -> Iterator[Frame]:

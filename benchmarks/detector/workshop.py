@@ -36,7 +36,7 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.assets.photographing import Sensors
 from benchmarks.light.shadow_scenes import block, nearest_object, placed, shipped, worn
 from benchmarks.record import ROOT, figure, recording
-from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_model
 from mitsplat.bake.part_shapes import bake_lights, mitsuba_scene
 from mitsplat.capture.lighting.panorama import unit_vector
 from mitsplat.geometry.camera import Camera
@@ -200,7 +200,7 @@ def workshop(rng: np.random.Generator, *, poured: bool) -> tuple[MeshPart, ...]:
         inner = block((-0.14, -0.11, 0.004), (0.14, 0.11, 0.2))
         tray = trimesh.boolean.difference([outer, inner], engine="manifold")
         room["tray"] = _worn(tray, m.cast(colours[10], rng, size=64), rng)
-    return read_parts(trimesh.Scene(room))
+    return read_model(trimesh.Scene(room)).parts
 
 
 def _worn(mesh: trimesh.Trimesh, image: m.Pixels, rng: np.random.Generator) -> trimesh.Trimesh:

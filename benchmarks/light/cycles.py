@@ -33,7 +33,7 @@ from PIL import Image
 
 # isort: on
 from benchmarks.record import figure, recording
-from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_model
 from mitsplat.geometry.mesh_normals import corner_normals
 from mitsplat.images.colour import decode_srgb, encode_srgb
 from mitsplat.renderer.scene_emitters import emitter_dict
@@ -47,7 +47,7 @@ BOUNCES = 6
 def export_setup(setup: Setup, lights: Sequence[LightSpec], folder: Path, samples: int) -> None:
     """Write the files that ``blender_scene.py`` reads."""
     folder.mkdir(parents=True, exist_ok=True)
-    parts = [*read_parts(setup.room), *(part for thing in setup.things for part in placed(thing))]
+    parts = [*read_model(setup.room).parts, *(part for thing in setup.things for part in placed(thing))]
     camera = setup.camera
     scene = {
         "parts": [export_part(part, folder, number) for number, part in enumerate(parts)],

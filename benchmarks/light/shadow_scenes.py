@@ -19,7 +19,7 @@ import trimesh
 
 # isort: on
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_model
 from mitsplat.geometry.camera import Camera
 from mitsplat.renderer.layers import make_sensor
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
@@ -244,7 +244,7 @@ def baked(
     """Return the asset in ``folder``, baked if absent."""
     if not (folder / "asset.yaml").exists():
         settings = BakeSettings(gaussians=gaussians, fit_steps=0, verify_views=0, density=density)
-        mesh = trimesh.util.concatenate([part.mesh for part in read_parts(scene)])
+        mesh = trimesh.util.concatenate([part.mesh for part in read_model(scene).parts])
         pieces = [trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull]  # for physics, unused here
         result = bake_asset(scene, name=folder.name, kind=kind, lights=lights, settings=settings, pieces=pieces)
         result.asset.save(folder)
@@ -255,7 +255,7 @@ def placed(thing: Thing) -> tuple[MeshPart, ...]:
     """Return the parts of an object in its pose."""
     scene = thing.mesh.copy()
     scene.apply_transform(thing.pose)
-    return tuple(replace(part, name=f"{thing.name} {part.name}") for part in read_parts(scene))
+    return tuple(replace(part, name=f"{thing.name} {part.name}") for part in read_model(scene).parts)
 
 
 def nearest_object(

@@ -46,7 +46,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates, max
 
 # isort: on
 from benchmarks.record import figure, recording
-from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_model
 from mitsplat.bake.part_shapes import bake_lights, mitsuba_scene
 from mitsplat.frames.camera_response import lit_picture
 from mitsplat.frames.scene_builder import make_asset_shape
@@ -126,7 +126,7 @@ def take_truth(setup: Setup, name: str, light: str, out: Path, samples: int) -> 
     shots = Photographer(setup.camera, out / name, samples)
     few = Photographer(setup.camera, out / name, samples // 16)  # for direct light, which has less noise
     lights = bake_lights(lights_of(light, out))
-    room, things = read_parts(setup.room), [placed(thing) for thing in setup.things]
+    room, things = read_model(setup.room).parts, [placed(thing) for thing in setup.things]
     everything = [*room, *(part for parts in things for part in parts)]
     photo, _ = shots.take(f"{light}_photo", everything, lights)
     empty, _ = shots.take(f"{light}_empty", room, lights)

@@ -154,17 +154,6 @@ class MeshModel:
     warnings: tuple[str, ...] = ()
 
 
-def read_parts(
-    mesh: trimesh.Trimesh | trimesh.Scene | MeshFile | str | Path,
-    *,
-    metres_per_unit: float | None = None,
-    up: Literal["y", "z"] | None = None,
-    finish: SurfaceFinish | None = None,
-) -> tuple[MeshPart, ...]:
-    """Return the parts of :func:`read_model`."""
-    return read_model(mesh, metres_per_unit=metres_per_unit, up=up, finish=finish).parts
-
-
 def read_model(
     mesh: trimesh.Trimesh | trimesh.Scene | MeshFile | str | Path,
     *,

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import mitsplat
 from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.mesh_parts import read_parts
+from mitsplat.bake.mesh_parts import read_model
 from mitsplat.bake.part_shapes import UNIFORM_LIGHT, bake_lights, mitsuba_scene
 from mitsplat.errors import InputError
 from mitsplat.gaussians.poisson_disks import poisson_subset
@@ -84,7 +84,7 @@ def test_traced_radiance_of_a_lit_plane_is_albedo_times_irradiance_over_pi() -> 
     plane.visual.face_colors = [255, 255, 255, 255]
     lamp = AreaLight(position=(0, 0, 2.0), target=(0, 0, 0), size=(0.1, 0.2), radiance=50.0)
     sky = EnvironmentLight(radiance=0.25)
-    scene = mitsuba_scene(read_parts(plane), bake_lights([lamp, sky]))
+    scene = mitsuba_scene(read_model(plane).parts, bake_lights([lamp, sky]))
     rays = np.tile([[0.0, 0.0, 0.5]], (64, 1)), np.tile([[0.0, 0.0, -1.0]], (64, 1))
     radiance, hit = trace_radiance(scene, *rays, samples=64, bounces=1, seed=1)
     assert hit.all()
@@ -229,9 +229,9 @@ def test_kind_and_light_determine_pieces_and_capture_light(tmp_path: Path) -> No
 
 def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box() -> None:
     ball = trimesh.creation.icosphere(4, 1.0)
-    (part,) = read_parts(ball)
+    (part,) = read_model(ball).parts
     np.testing.assert_allclose(corner_normals(part.mesh), part.mesh.triangles, atol=0.01)
-    (part,) = read_parts(trimesh.creation.box())
+    (part,) = read_model(trimesh.creation.box()).parts
     assert np.pi / 2 > CREASE_ANGLE
     np.testing.assert_allclose(
         corner_normals(part.mesh), np.repeat(part.mesh.face_normals[:, None], 3, axis=1), atol=1e-6
@@ -351,7 +351,7 @@ def test_large_object_bakes_with_any_size_and_reports_its_stages() -> None:
 def test_path_traced_image_equals_single_rays_through_its_pixels() -> None:
     """Slow reference: the camera model's rays are traced one by one. Radiance 1 on white gives no noise."""
     ball = white(trimesh.creation.icosphere(3, 0.02))
-    scene = mitsuba_scene(read_parts(ball), UNIFORM_LIGHT)
+    scene = mitsuba_scene(read_model(ball).parts, UNIFORM_LIGHT)
     camera = Camera.look_at((0.05, -0.06, 0.04), (0, 0, 0), width=24, height=18, fov_x=40, near=0.01)
     picture, cover = render_mesh(scene, camera, samples=1, bounces=2)
     x, y = np.meshgrid(np.arange(24) + 0.5, np.arange(18) + 0.5)
@@ -369,7 +369,7 @@ def test_noise_of_different_pixels_differs() -> None:
     """If all paths shared their random numbers, the mean of the image would be as noisy as one pixel."""
     cup = white(trimesh.creation.annulus(0.01, 0.02, 0.03))
     lamp = AreaLight(position=(0.05, 0.03, 0.2), target=(0, 0, 0), size=(0.1, 0.1), radiance=10.0)
-    scene = mitsuba_scene(read_parts(cup), bake_lights([lamp]))
+    scene = mitsuba_scene(read_model(cup).parts, bake_lights([lamp]))
     camera = Camera.look_at((0.0, -0.04, 0.06), (0, 0, 0), width=48, height=48, fov_x=30, near=0.01)
     pictures = np.array([render_mesh(scene, camera, samples=1, bounces=3, seed=seed)[0] for seed in range(6)])
     inside = pictures.std(axis=0)[pictures.min(axis=0) > 0].mean()
@@ -431,7 +431,7 @@ def test_picture_of_few_samples_is_no_darker_than_one_of_many() -> None:
         AreaLight(position=(-0.6, 0.2, 0.8), size=(0.3, 0.3), radiance=7.0),
     ]
     table = white(trimesh.creation.box(bounds=[[-0.5, -0.5, -0.1], [0.5, 0.5, 0.0]]))
-    scene = mitsuba_scene(read_parts(table), bake_lights(lights))
+    scene = mitsuba_scene(read_model(table).parts, bake_lights(lights))
     camera = Camera.look_at((0, -0.3, 0.5), (0, 0, 0), width=40, height=30, fov_x=30)
     few, many = (render_mesh(scene, camera, samples=samples)[0].mean() for samples in (16, 1024))
     assert few == pytest.approx(many, rel=0.02)
@@ -440,7 +440,7 @@ def test_picture_of_few_samples_is_no_darker_than_one_of_many() -> None:
 def test_baked_lights_keep_their_order() -> None:
     """Mitsuba lists emitters that it loads from one dictionary in arbitrary order, and paths depend on the order."""
     lamps = [AreaLight(position=(0.2 * i, 0, 1), target=(0.2 * i, 0, 0), radiance=1.0) for i in range(8)]
-    plane = read_parts(trimesh.creation.box((1, 1, 0.1)))
+    plane = read_model(trimesh.creation.box((1, 1, 0.1))).parts
     for _ in range(6):
         scene = mitsuba_scene(plane, bake_lights(lamps))
         found = [float(np.ravel(emitter.get_shape().bbox().center())[0]) for emitter in scene.emitters()]

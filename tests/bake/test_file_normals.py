@@ -13,7 +13,7 @@ from PIL import Image
 
 from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings, bake_asset
-from mitsplat.bake.mesh_parts import read_model, read_parts
+from mitsplat.bake.mesh_parts import read_model
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.errors import InputError
 from mitsplat.geometry.mesh_normals import corner_normals, normal_matrix, smooth_normals, stated_normals
@@ -120,7 +120,7 @@ def test_exact_normals_of_a_coarse_sphere_reach_its_proxy(
     writer: Callable[[Path, trimesh.Trimesh, np.ndarray], Path], tmp_path: Path
 ) -> None:
     """The interpolated normals at the centres of the faces are radial. Computed ones are 20 degrees off."""
-    (bare,) = read_parts(ball()[0])
+    (bare,) = read_model(ball()[0]).parts
     assert np.abs(smooth_normals(bare.mesh) - bare.mesh.triangles / RADIUS).max() > 0.3
     path = writer(tmp_path / "ball", *ball())
     baked = bake_asset(path, name="ball", settings=QUICK)
@@ -174,7 +174,7 @@ def test_split_normals_of_a_box_change_nothing(tmp_path: Path) -> None:
 def test_normals_follow_uneven_scales_and_mirrored_nodes(sign: int, tmp_path: Path) -> None:
     """The normal of an ellipsoid x = D s of the unit sphere s is along D^-1 s. glTF's y points up: (x, -z, y)."""
     scale = np.array([sign * 2.0, 1.0, 0.5])
-    (part,) = read_parts(glb(tmp_path / "a", *ball(), scale=scale.tolist()))
+    (part,) = read_model(glb(tmp_path / "a", *ball(), scale=scale.tolist())).parts
     y_up = part.mesh.triangles @ np.array([(1, 0, 0), (0, 0, -1), (0, 1, 0)])
     expected = (y_up / scale**2) @ np.array([(1, 0, 0), (0, 0, -1), (0, 1, 0)]).T
     expected /= np.linalg.norm(expected, axis=2, keepdims=True)
@@ -251,7 +251,7 @@ def test_normals_of_a_skinned_part_turn_with_its_joints(tmp_path: Path) -> None:
     made.mesh(attributes, made.accessor(mesh.faces.ravel().astype("u4")))
     joint = {"rotation": [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], "scale": [2, 1, 1]}
     nodes, scenes = [{"mesh": 0, "skin": 0}, joint], [{"nodes": [0, 1]}]
-    (part,) = read_parts(made.save(tmp_path / "a.glb", nodes=nodes, scenes=scenes, skins=[{"joints": [1]}]))
+    (part,) = read_model(made.save(tmp_path / "a.glb", nodes=nodes, scenes=scenes, skins=[{"joints": [1]}])).parts
     expected = part.mesh.triangles / (4.0, 1.0, 1.0)
     expected /= np.linalg.norm(expected, axis=2, keepdims=True)
     np.testing.assert_allclose(corner_normals(part.mesh), expected, atol=1e-5)
@@ -265,7 +265,7 @@ def test_cut_out_faces_keep_the_normals_of_their_places(tmp_path: Path) -> None:
     arrays = {"POSITION": mesh.vertices, "NORMAL": normals, "COLOR_0": np.hstack([np.ones((66, 3)), alpha])}
     attributes = {name: made.accessor(values.astype("f4")) for name, values in arrays.items()}
     made.mesh(attributes, made.accessor(mesh.faces.ravel().astype("u4")), {"alphaMode": "MASK"})
-    (part,) = read_parts(made.save(tmp_path / "a.glb"))
+    (part,) = read_model(made.save(tmp_path / "a.glb")).parts
     assert len(part.mesh.faces) > 200
     radial = part.mesh.triangles / np.linalg.norm(part.mesh.triangles, axis=2, keepdims=True)
     np.testing.assert_allclose(corner_normals(part.mesh), radial, atol=0.03)
@@ -302,7 +302,7 @@ def test_colours_of_an_obj_file_are_read_with_its_normals(tmp_path: Path) -> Non
     shades = iter(mesh.vertices[:, 2] / RADIUS / 2 + 0.5)
     lines = [f"{line} {next(shades)} 0 0" if line.startswith("v ") else line for line in path.read_text().split("\n")]
     path.write_text("\n".join(lines))
-    (part,) = read_parts(path)
+    (part,) = read_model(path).parts
     assert part.colours is not None
     expected = decode_srgb(part.mesh.triangles[..., 2] / RADIUS / 2 + 0.5)
     np.testing.assert_allclose(part.colours[..., 0], expected, atol=0.01)
@@ -328,7 +328,7 @@ def test_normals_of_a_ply_file_with_seams_of_its_texture_are_read(corners: int, 
     uv = np.random.default_rng(0).random((len(polygons), 2 * corners)).round(1)
     lines += [" ".join(map(str, [corners, *f, 2 * corners, *t])) for f, t in zip(polygons, uv, strict=True)]
     (tmp_path / "a.ply").write_text("\n".join(lines) + "\n")
-    (part,) = read_parts(tmp_path / "a.ply")
+    (part,) = read_model(tmp_path / "a.ply").parts
     assert part.texture is not None
     expected = part.mesh.triangles * ((1, 1, 1) if corners == 3 else (1, 0, 1)) / RADIUS
     np.testing.assert_allclose(corner_normals(part.mesh), expected, atol=1e-5)
@@ -372,7 +372,7 @@ def test_files_without_normals_and_meshes_in_memory_have_computed_normals(tmp_pa
     mesh.export(tmp_path / "a.ply")
     held = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, process=False)
     for source in (tmp_path / "a.stl", tmp_path / "a.obj", tmp_path / "a.ply", held):
-        (part,) = read_parts(source)
+        (part,) = read_model(source).parts
         assert stated_normals(part.mesh) is None
 
 

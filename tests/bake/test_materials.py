@@ -15,7 +15,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from mitsplat.bake.bake import BakeResult, BakeSettings, bake_asset
 from mitsplat.bake.bake_report import write_bake_report
-from mitsplat.bake.mesh_parts import MeshPart, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_model
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.fit.image_metrics import psnr_of
@@ -45,7 +45,7 @@ def write_obj(folder: Path, lines: str, *, name: str = "box") -> Path:
 
 
 def part_of(folder: Path, lines: str, **finish: object) -> MeshPart:
-    (part,) = read_parts(write_obj(folder, lines), finish=SurfaceFinish(**finish))  # type: ignore[arg-type]
+    (part,) = read_model(write_obj(folder, lines), finish=SurfaceFinish(**finish)).parts  # type: ignore[arg-type]
     return part
 
 
@@ -153,14 +153,14 @@ def test_factors_and_vertex_colours_of_gltf_are_linear(tmp_path: Path) -> None:
     """glTF 2.0, sections 3.9.2 and 3.7.2.1."""
     grey = PBRMaterial(baseColorFactor=[128, 128, 128, 255], metallicFactor=0.0, roughnessFactor=1.0)
     box(TextureVisuals(material=grey)).export(tmp_path / "factor.glb")
-    (part,) = read_parts(tmp_path / "factor.glb")
+    (part,) = read_model(tmp_path / "factor.glb").parts
     np.testing.assert_allclose(colour_of(part), 128 / 255, atol=1e-6)
     painted = box()
     painted.visual.vertex_colors = (128, 128, 128, 255)
     painted.export(tmp_path / "colours.glb")
     painted.export(tmp_path / "colours.ply")
     for suffix, colour in (("glb", 128 / 255), ("ply", decode_srgb(128 / 255))):
-        (part,) = read_parts(tmp_path / f"colours.{suffix}")
+        (part,) = read_model(tmp_path / f"colours.{suffix}").parts
         np.testing.assert_allclose(colour_of(part), colour, atol=1e-6)
 
 
@@ -175,7 +175,7 @@ def test_each_gaussian_has_the_metalness_and_roughness_of_its_texels(tmp_path: P
     texels = np.zeros((4, 8, 3), np.uint8)
     texels[:, :4], texels[:, 4:] = (0, 255, 0), (0, 102, 255)
     gloss_box(metallicRoughnessTexture=Image.fromarray(texels)).export(tmp_path / "box.glb")
-    (part,) = read_parts(tmp_path / "box.glb")
+    (part,) = read_model(tmp_path / "box.glb").parts
     faces, corner = np.arange(12), np.tile([0.6, 0.2, 0.2], (12, 1))
     np.testing.assert_allclose(part.materials_at(faces, corner), [[0, 0.5, 0.5]] * 12, atol=0.003)
     np.testing.assert_allclose(part.materials_at(faces, corner[:, [1, 0, 2]]), [[1, 0.2, 0.5]] * 12, atol=0.003)
@@ -185,7 +185,7 @@ def test_each_gaussian_has_the_metalness_and_roughness_of_its_texels(tmp_path: P
     for values, pair in ((baked.metallic, (0, 1)), (baked.roughness, (0.5, 0.2))):
         assert [(np.abs(values - value) < 0.01).mean() > 0.1 for value in pair] == [True, True]
     finish = SurfaceFinish(metallic=0.0)
-    (part,) = read_parts(tmp_path / "box.glb", finish=finish)
+    (part,) = read_model(tmp_path / "box.glb", finish=finish).parts
     np.testing.assert_allclose(part.materials_at(faces, corner[:, [1, 0, 2]]), [[0, 0.2, 0.5]] * 12, atol=0.003)
 
 
@@ -227,7 +227,7 @@ def test_mtl_and_matt_materials_reach_the_gaussians(tmp_path: Path) -> None:
 def test_mtl_roughness_and_metalness_out_of_range_are_refused(tmp_path: Path, line: str, sentence: str) -> None:
     """They were limited to the range, or left out."""
     with pytest.raises(InputError, match=sentence):
-        read_parts(write_obj(tmp_path, line))
+        read_model(write_obj(tmp_path, line))
 
 
 def test_texture_without_a_factor_is_not_scaled() -> None:
@@ -274,11 +274,11 @@ def test_missing_textures_are_refused_unless_a_colour_is_given(tmp_path: Path) -
     with pytest.raises(
         InputError, match=r"box\.mtl: its texture absent\.png is missing; put it there, or give a colour"
     ):
-        read_parts(path)
-    assert read_parts(path, finish=SurfaceFinish(colour="red"))
+        read_model(path)
+    assert read_model(path, finish=SurfaceFinish(colour="red")).parts
     (tmp_path / "box.mtl").unlink()
     with pytest.raises(InputError, match=r"box\.obj: its material file box\.mtl is missing") as missing:
-        read_parts(path)
+        read_model(path)
     assert missing.value.__cause__ is not missing.value
 
 
@@ -290,17 +290,17 @@ def test_textures_outside_of_the_folder_are_refused(tmp_path: Path, name: str) -
     name = name.replace("{folder}", str(tmp_path))
     path = write_obj(tmp_path / "in", f"map_Kd {name}")
     with pytest.raises(InputError, match=r"box\.mtl: its texture .* is outside of its folder; put it there"):
-        read_parts(path)
+        read_model(path)
     (tmp_path / "in/box.mtl").rename(tmp_path / "box.mtl")
     path.write_text(path.read_text().replace("mtllib box.mtl", "mtllib ../box.mtl"))
     with pytest.raises(InputError, match=r"box\.obj: its material file \.\./box\.mtl is outside of its folder"):
-        read_parts(path)
+        read_model(path)
 
 
 def test_a_16_bit_grey_texture_keeps_its_brightness(tmp_path: Path) -> None:
     path = write_obj(tmp_path, "map_Kd colour.png")
     Image.fromarray(np.full((8, 8), 0x4080, dtype=np.uint16)).save(tmp_path / "colour.png")
-    (part,) = read_parts(path)
+    (part,) = read_model(path).parts
     np.testing.assert_allclose(colour_of(part), decode_srgb(np.full(3, 0x40 / 255)), atol=1e-3)
 
 
@@ -310,7 +310,7 @@ def test_textures_and_materials_that_cannot_be_read_are_refused(tmp_path: Path) 
 
     def refused(path: Path, match: str) -> None:
         with pytest.raises(InputError, match=match) as told:
-            read_parts(path)
+            read_model(path)
         assert str(told.value).startswith(str(path.parent))
 
     (tmp_path / "colour.png").write_bytes(cut)
@@ -347,14 +347,14 @@ def test_meshes_with_invalid_faces_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.glb").write_bytes(b"")
     for name in ("far.obj", "empty.glb"):
         with pytest.raises(InputError, match=name):
-            read_parts(tmp_path / name)
+            read_model(tmp_path / name)
 
 
 def test_a_missing_reader_of_a_format_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "box.dae").write_text("<COLLADA/>")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(MissingResourceError, match=r"box\.dae: reading it needs `pip install pycollada`"):
-        read_parts(tmp_path / "box.dae")
+        read_model(tmp_path / "box.dae")
 
 
 @pytest.mark.parametrize("gaussians", [1, 2])

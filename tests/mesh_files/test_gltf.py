@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mitsplat.bake.mesh_parts import MeshPart, read_model, read_parts
+from mitsplat.bake.mesh_parts import MeshPart, read_model
 from mitsplat.bake.proxy_mesh import make_proxy
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.images.colour import encode_srgb
@@ -34,7 +34,7 @@ def samples(part: MeshPart) -> tuple[np.ndarray, np.ndarray]:
 
 def read(path: Path) -> tuple[MeshPart, ...]:
     """Read a file in its own axes."""
-    return read_parts(path, up="z")
+    return read_model(path, up="z").parts
 
 
 def shown_uv(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from mitsplat.bake.mesh_parts import read_model, read_parts
+from mitsplat.bake.mesh_parts import read_model
 from mitsplat.errors import InputError
 from mitsplat.images.colour import decode_srgb
 
@@ -49,7 +49,7 @@ def test_paths_of_windows_are_found(tmp_path: Path, library: str, texture: str, 
     (tmp_path / library.replace("\\", "/").replace("BOX.MTL", "box.mtl")).write_text(
         f"newmtl paint\nmap_Kd {texture}\n"
     )
-    (part,) = read_parts(write_obj(tmp_path / "box.obj", library))
+    (part,) = read_model(write_obj(tmp_path / "box.obj", library)).parts
     shown = part.colours_at(np.arange(12), np.full((12, 3), 1 / 3))
     np.testing.assert_allclose(shown, [decode_srgb(np.array(COLOUR) / 255)] * 12, atol=1e-6)
 
@@ -60,7 +60,7 @@ def test_paths_of_windows_stay_in_the_folder(tmp_path: Path, texture: str) -> No
     Image.new("RGB", (8, 8)).save(tmp_path / "secret.png")
     (tmp_path / "in/box.mtl").write_text(f"newmtl paint\nmap_Kd {texture}\n")
     with pytest.raises(InputError, match=r"box\.mtl: its texture .* is (outside of its folder|missing); put it there"):
-        read_parts(write_obj(tmp_path / "in/box.obj", "box.mtl"))
+        read_model(write_obj(tmp_path / "in/box.obj", "box.mtl"))
 
 
 @pytest.mark.parametrize("kind", ["obj", "ply"])
@@ -201,7 +201,7 @@ def test_a_truncated_stl_is_refused_with_its_likely_cause(tmp_path: Path) -> Non
     content = trimesh.creation.box((0.06, 0.06, 0.06)).export(file_type="stl")
     (tmp_path / "a.stl").write_bytes(content[:-100])
     with pytest.raises(InputError, match=r"a\.stl: a mesh needs at least one face \(got none; is the file complete\?"):
-        read_parts(tmp_path / "a.stl")
+        read_model(tmp_path / "a.stl")
 
 
 @pytest.mark.parametrize("is_coloured", [False, True])

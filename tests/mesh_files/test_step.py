@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mitsplat.bake.mesh_parts import read_parts
+from mitsplat.bake.mesh_parts import read_model
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.images.colour import encode_srgb
 from mitsplat.mesh_files.step import CLOSEST_VIEW, read_step, separate_parts
@@ -53,7 +53,7 @@ def assembly(path: Path, unit: str = "mm", schema: str = "AP214") -> Path:
 def test_units_poses_names_and_colours_are_those_of_the_file(
     in_process: None, tmp_path: Path, unit: str, metres: float, schema: str
 ) -> None:
-    block, standing, lying = read_parts(assembly(tmp_path / "a.stp", unit, schema))
+    block, standing, lying = read_model(assembly(tmp_path / "a.stp", unit, schema)).parts
     assert block.name == "block" and standing.name == "pin no. 1"
     np.testing.assert_allclose(block.mesh.bounds, metres * np.array([(0, 0, 0), (10, 20, 30)]), atol=1e-6 * metres)
     np.testing.assert_allclose(standing.mesh.bounds[:, 2], metres * np.array([0, 40]), atol=1e-5 * metres)
@@ -66,7 +66,7 @@ def test_units_poses_names_and_colours_are_those_of_the_file(
 
 
 def test_a_solid_of_several_colours_is_closed(in_process: None, tmp_path: Path) -> None:
-    _, pin, _ = read_parts(assembly(tmp_path / "a.step"))
+    _, pin, _ = read_model(assembly(tmp_path / "a.step")).parts
     assert pin.mesh.is_watertight and not pin.double_sided
     assert pin.mesh.volume == pytest.approx(np.pi * 0.005**2 * 0.04, rel=0.01)
 
@@ -94,7 +94,7 @@ def test_equal_parts_are_found_and_the_smallest_defines_the_tolerance(in_process
     assert file.tolerance == pytest.approx(0.5 * 30.0 / CLOSEST_VIEW)
     parts = separate_parts(file)
     assert {name: count for name, (_, count) in parts.items()} == {"block": 1, "pin_no._1": 2}
-    (pin,) = read_parts(parts["pin_no._1"][0])
+    (pin,) = read_model(parts["pin_no._1"][0]).parts
     np.testing.assert_allclose(pin.mesh.bounds[:, 2], [0.0, 0.04], atol=1e-7)
 
 

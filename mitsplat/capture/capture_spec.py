@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from mitsplat.geometry.lens import Lens
-from mitsplat.storage.field_types import Positive
+from mitsplat.storage.field_types import Positive, StrictModel
 
 _Row = tuple[float, float, float, float]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PhotoCamera(_Strict):
+class PhotoCamera(StrictModel):
     """Keys of a camera, as in :class:`~mitsplat.geometry.camera.Camera`."""
 
     width: int
@@ -31,7 +27,7 @@ class PhotoCamera(_Strict):
     world_from_camera: tuple[_Row, _Row, _Row, _Row]
 
 
-class PhotoSpec(_Strict):
+class PhotoSpec(StrictModel):
     """Keys of a photo; file names are relative to the capture folder, and ``gain`` is absent without a correction."""
 
     name: str = Field(min_length=1)
@@ -41,7 +37,7 @@ class PhotoSpec(_Strict):
     gain: tuple[Positive, Positive, Positive] | None = Field(None, exclude_if=lambda gain: gain is None)
 
 
-class CaptureSpec(_Strict):
+class CaptureSpec(StrictModel):
     """Keys of ``capture.json``."""
 
     format_version: int = Field(1, ge=1)

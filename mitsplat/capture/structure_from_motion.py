@@ -25,7 +25,7 @@ from mitsplat.arrays import AnyArray, Float64Array, Int32Array
 from mitsplat.capture.photos import Prepared
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.camera import Camera
-from mitsplat.geometry.rigid import homogeneous_matrix
+from mitsplat.geometry.rigid import nearest_rigid
 from mitsplat.geometry.triangulation import count_observers
 from mitsplat.progress import Progress
 from mitsplat.runtime.child_process import python_command, python_environment
@@ -217,9 +217,7 @@ def opencv_camera(
     values = np.append(np.asarray(params, dtype=np.float64), 0.0)
     fx, fy, cx, cy, *distortion = (float(values[place]) for place in _MODELS[model])
     # Quaternions of text files have few digits, so use the nearest rotation.
-    u, _, vt = np.linalg.svd(camera_from_world[:3, :3])
-    rotation = (u @ vt).T
-    pose = homogeneous_matrix(rotation, -rotation @ camera_from_world[:3, 3])
+    pose = np.asarray(np.linalg.inv(nearest_rigid(camera_from_world)))
     fisheye = model.endswith("_FISHEYE")
     try:
         return Camera(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
 from mitsplat.errors import InputError
-from mitsplat.storage.files import is_inside
+from mitsplat.storage.files import is_inside, resolve_inside
 
 _DRIVE = re.compile(r"[A-Za-z]:[\\/]")
 
@@ -32,8 +33,8 @@ def find_reference(source: Path, name: str, kind: str, *, folder: Path | None = 
     if _DRIVE.match(name):
         plain = PurePosixPath(plain).name
     for spelling in dict.fromkeys((name, plain)):
-        if is_inside(folder, str(base / spelling)) and _is_file(base / spelling):
-            return base / spelling
+        with suppress(InputError):
+            return resolve_inside(folder, str(base / spelling))
     found = _in_other_case(base, plain)
     if found is not None and is_inside(folder, str(found)):
         return found
@@ -54,10 +55,3 @@ def _in_other_case(folder: Path, name: str) -> Path | None:
             return None
         path = alike[0]
     return path if path.is_file() else None
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # not a valid file name
-        return False

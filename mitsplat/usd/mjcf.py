@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +31,7 @@ from mitsplat.physics.newton_model import CONTACT_TIME, DAMPING_RATIO, IMPEDANCE
 from mitsplat.physics.settle import warp_settings
 from mitsplat.progress import discard_note
 from mitsplat.scene.scene import Scene
-from mitsplat.storage.files import storage_errors, write_file
+from mitsplat.storage.files import storage_errors, write_text
 from mitsplat.usd.frame_content import FrameContent, PlacedObject, frame_content
 from mitsplat.usd.simulator_poses import identifier
 
@@ -79,13 +78,11 @@ def _write_model(content: FrameContent, path: Path) -> tuple[str, ...]:
         files.mkdir(exist_ok=True)
         for file in Path(folder).iterdir():
             file.replace(files / file.name)
-        write_file(path, lambda part: part.write_text(text, encoding="utf-8"))
-    return (*content.notes, "splats; their proxy meshes are visible", *_light_notes(content))
-
-
-def _light_notes(content: FrameContent) -> Iterable[str]:
+        write_text(path, text)
+    notes = [*content.notes, "splats; their proxy meshes are visible"]
     if content.lights:
-        yield "sizes, radiances and images of lights; MuJoCo has positions and colours"
+        notes.append("sizes, radiances and images of lights; MuJoCo has positions and colours")
+    return tuple(notes)
 
 
 class _ModelWriter:

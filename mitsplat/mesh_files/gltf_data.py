@@ -53,13 +53,11 @@ class GltfData:
         if content[:4] == _MAGIC:
             content = self._read_chunks(content)
         self.document: JsonObject = json.loads(content.rstrip(b"\0").decode("utf-8-sig"))
-        if not isinstance(self.document, dict) or not str(self._asset_version()).startswith("2."):
-            raise ValueError(f"only version 2 of glTF can be read (got {self._asset_version()!r})")
+        version = self.document["asset"]["version"]
+        if not str(version).startswith("2."):
+            raise ValueError(f"only version 2 of glTF can be read (got {version!r})")
         self.buffer = cache(self._read_buffer)
         self.image = cache(self._read_image)
-
-    def _asset_version(self) -> object:
-        return self.document["asset"]["version"]
 
     def _read_chunks(self, content: bytes) -> bytes:
         """Return the JSON chunk of a binary file; the other chunk is the first buffer."""

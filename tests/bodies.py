@@ -26,7 +26,8 @@ def pose_at(position: ArrayLike, rotation: Rotation | None = None) -> NDArray[np
 
 def draw_start_poses(drop, assets, rng, arrangement="drop"):
     """Draw start poses (N, 4, 4) of assets in the only region of a scene."""
-    return drop.start_poses.draw(drop.start_poses.items(assets), drop.static_scenes[0], rng, [arrangement])
+    items = [drop.start_poses.item(asset) for asset in assets]
+    return drop.start_poses.draw(items, drop.static_scenes[0], rng, [arrangement])
 
 
 def lowest(mesh: trimesh.Trimesh, pose: NDArray[np.float64]) -> float:

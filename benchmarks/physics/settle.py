@@ -226,7 +226,7 @@ def measure_bin(count: int) -> None:
 def _start_poses(drop: Drop, assets: Sequence[int], seed: int) -> Float64Array:
     """Draw start poses (N, 4, 4) of assets in the first region."""
     arrangements = [possible[0] for _, possible in drop.scene.spec.all_regions]
-    items, rng = drop.start_poses.items(assets), np.random.default_rng(seed)
+    items, rng = [drop.start_poses.item(asset) for asset in assets], np.random.default_rng(seed)
     return drop.start_poses.draw(items, drop.static_scenes[0], rng, arrangements)
 
 

@@ -77,7 +77,8 @@ def _crowded_regions(scene: Scene, layout: int, start_poses: StartPoses, static:
         rng = random_stream(spec.seed, "object poses", layout, 0)
         return start_poses.find(items, static, rng, arrangements) is not None
 
-    items = start_poses.items(*draw_objects(scene, layout), draw_regions(spec, layout))
+    drawn = zip(*draw_objects(scene, layout), draw_regions(spec, layout), strict=True)
+    items = [start_poses.item(*one) for one in drawn]
     if has_room(items):
         return "", True
     contents = {region: [item for item in items if item.region == region] for region in {item.region for item in items}}

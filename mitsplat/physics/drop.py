@@ -205,8 +205,8 @@ class Drop:
 
     def _items(self, drawn: Sequence[_DrawnObject], given: Sequence[Float64Array | None] = ()) -> list[Item]:
         """Return objects to place, with the given poses or else those of the scene file."""
-        assets, regions = [one.asset for one in drawn], [one.region for one in drawn]
-        return self.start_poses.items(assets, given or [one.given for one in drawn], regions)
+        poses = given or [one.given for one in drawn]
+        return [self.start_poses.item(one.asset, pose, one.region) for one, pose in zip(drawn, poses, strict=True)]
 
     def _try(self, index: int, drawn: Sequence[_DrawnObject], refused: Sequence[str]) -> Layout | _Rejection:
         """Drop the given objects from the next draw of start poses."""

@@ -33,20 +33,9 @@ class StartPoses:
         """Return the mesh of an asset at a pose (4, 4)."""
         return PlacedSurface(self.scene.assets[asset].name, self.objects[asset].surface, pose)
 
-    def items(
-        self, assets: Sequence[int], given: Sequence[Float64Array | None] = (), regions: Sequence[int] | None = None
-    ) -> list[Item]:
-        """Return the objects to place, with poses (4, 4) from the scene file and start regions."""
-        return [
-            Item(
-                asset,
-                self.objects[asset].surface,
-                self.objects[asset].body.outline,
-                given[i] if given else None,
-                regions[i] if regions else 0,
-            )
-            for i, asset in enumerate(assets)
-        ]
+    def item(self, asset: int, pose: Float64Array | None = None, region: int = 0) -> Item:
+        """Return an object to place, with a pose (4, 4) from the scene file or in a start region."""
+        return Item(asset, self.objects[asset].surface, self.objects[asset].body.outline, pose, region)
 
     def find(
         self, items: Sequence[Item], static: StaticScene, rng: np.random.Generator, arrangements: Sequence[Arrangement]

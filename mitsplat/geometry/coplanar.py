@@ -59,7 +59,7 @@ def _planes(
     triangles = np.asarray(mesh.triangles, dtype=np.float64)
     reaches = ((triangles.min(axis=1) <= high) & (triangles.max(axis=1) >= low)).all(axis=1)
     triangles = triangles[reaches] - middle
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = trimesh.triangles.cross(triangles)
     lengths = np.linalg.norm(normals, axis=1)
     triangles, normals = triangles[lengths > 0], normals[lengths > 0] / lengths[lengths > 0, None]
     planes = np.column_stack([normals, (normals * triangles[:, 0]).sum(axis=1)])

@@ -12,6 +12,7 @@ from typing import get_args
 
 import numpy as np
 import shapely
+import trimesh
 from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes
 from scipy.spatial.transform import Rotation
 
@@ -159,7 +160,7 @@ def largest_plane(
     """
     rng = np.random.default_rng(0)
     corners = points[rng.integers(0, len(points), (_SAMPLES, 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = trimesh.triangles.cross(corners)
     lengths = np.linalg.norm(normals, axis=1)
     apart = lengths > 1e-12
     normals, corners = normals[apart] / lengths[apart, None], corners[apart, 0]

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from mitsplat.arrays import Float64Array, IntegerArray
+from mitsplat.arrays import Float64Array
 from mitsplat.renderer.rays.device_arrays import plain_mesh
 from mitsplat.runtime.variant import ensure_variant
 
@@ -28,12 +28,12 @@ def limit_motion(mesh: trimesh.Trimesh, vertices: Float64Array) -> Float64Array 
         Valid positions, (V, 3), or None if none were found.
     """
     share = np.ones((len(vertices), 1))
-    across = _normals(mesh.vertices, mesh.faces)
+    across = trimesh.triangles.cross(mesh.triangles)
     area = (across**2).sum(axis=1)
     crossed = edges_through_faces(mesh, mesh.vertices)
     for _ in range(_MAX_ROUNDS):
         found: Float64Array = mesh.vertices + share * (vertices - mesh.vertices)
-        broken = ~((_normals(found, mesh.faces) * across).sum(axis=1) >= _MIN_AREA_RATIO * area)
+        broken = ~((trimesh.triangles.cross(found[mesh.faces]) * across).sum(axis=1) >= _MIN_AREA_RATIO * area)
         crossing = np.setdiff1d(edges_through_faces(mesh, found), crossed)
         wrong = np.union1d(mesh.faces[broken], mesh.edges_unique[crossing])
         if not len(wrong):
@@ -56,9 +56,3 @@ def edges_through_faces(mesh: trimesh.Trimesh, vertices: Float64Array) -> npt.ND
     met = np.flatnonzero(np.array(hit.is_valid()))
     corners = faces[np.array(hit.prim_index)[met]]
     return np.asarray(met[~(corners[:, :, None] == edges[met][:, None, :]).any(axis=(1, 2))])
-
-
-def _normals(vertices: Float64Array, faces: IntegerArray) -> Float64Array:
-    """Return the normals of faces; their length is twice the area."""
-    a, b, c = np.moveaxis(np.asarray(vertices)[faces], 1, 0)
-    return np.cross(b - a, c - a)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import struct
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +23,7 @@ from mitsplat.images.masks import border_of
 from mitsplat.progress import Progress
 from mitsplat.runtime.cores import usable_cores
 from mitsplat.storage.file_kinds import check_path_encoding
-from mitsplat.storage.files import IMAGE_ERRORS, files_below, write_file
+from mitsplat.storage.files import IMAGE_ERRORS, copy_file, files_below, write_file
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 _RAW = (".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f")
@@ -203,7 +202,7 @@ def _prepare(
     if max(rgb.size) > max_size:
         rgb.thumbnail((max_size, max_size), Image.Resampling.LANCZOS)
     if kept and not file.exists():
-        write_file(file, partial(shutil.copyfile, path))
+        copy_file(path, file)
     elif not file.exists():
         options: dict[str, int | bytes] = {"quality": 95, "subsampling": 0} if lossy else {}
         options["exif"] = _upright_exif(turned)

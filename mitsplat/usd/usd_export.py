@@ -34,7 +34,7 @@ from mitsplat.physics.settle import warp_settings
 from mitsplat.progress import discard_note
 from mitsplat.scene.scene import Scene
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightSpec
-from mitsplat.storage.files import JsonObject, library_errors, storage_errors, write_file
+from mitsplat.storage.files import JsonObject, copy_file, library_errors, storage_errors
 from mitsplat.usd.frame_content import FrameContent, frame_content
 from mitsplat.usd.stage_reader import METADATA
 from mitsplat.usd.usd_layers import is_usd, require_usd
@@ -113,7 +113,7 @@ def _write_stage(path: Path, write: Callable[[_StageWriter], None]) -> None:
         except Tf.ErrorException as error:
             raise InputError(f"{path}: cannot be written ({str(error).splitlines()[0]})") from error
         with library_errors(path):
-            write_file(path, lambda part: shutil.copyfile(result, part))
+            copy_file(result, path)
 
 
 class _StageWriter:

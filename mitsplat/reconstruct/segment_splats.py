@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from mitsplat.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from mitsplat.capture.capture import known_where
 from mitsplat.errors import InputError
-from mitsplat.gaussians.spherical_harmonics import sh_basis
+from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.progress import Progress
@@ -176,8 +176,7 @@ class VisibleWeights:
         inside, outside = np.where(view.known, view.mask, 0), np.where(view.known, 1 - view.mask, 0)
         own, other = (mi.Float(np.ravel(part).astype(np.float32)) for part in (inside, outside))
         dr.backward(dr.sum(rgb[0] * own) + dr.sum(rgb[1] * other))
-        constant = float(sh_basis((0.0, 0.0, 1.0), 0).ravel()[0])
-        return np.array(dr.grad(colours), dtype=np.float64).reshape(-1, 3)[:, :2] / constant
+        return np.array(dr.grad(colours), dtype=np.float64).reshape(-1, 3)[:, :2] / SH_C0
 
 
 def _needles(splats: Splats, views: Sequence[MaskedView]) -> BoolArray:

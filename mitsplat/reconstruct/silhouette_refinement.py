@@ -152,10 +152,10 @@ def refine_mesh(
     outside = [view for view in views if np.linalg.norm(view.camera.centre - middle) > 1.05 * _VIEW_RADIUS * radius]
     if len(outside) < RefinedMesh.least_views:
         return RefinedMesh(False, mesh=mesh)
-    outlines = [Outline(view, middle, radius, settings.size) for view in outside]
-    every = min(_VALIDATION_EVERY, max(2, len(outlines) // 3))
-    validation = outlines[every // 2 :: every]
-    training = [outline for outline in outlines if outline not in validation]
+    masks = [SquareMask(view, middle, radius, settings.size) for view in outside]
+    every = min(_VALIDATION_EVERY, max(2, len(masks) // 3))
+    validation = masks[every // 2 :: every]
+    training = [mask for mask in masks if mask not in validation]
     start = trimesh.Trimesh((mesh.vertices - middle) / radius, mesh.faces, process=False)
     lowest = -np.inf if floor is None else (floor - middle[2]) / radius
     on_table = np.abs(start.vertices[:, 2] - lowest) < _BASE_HEIGHT
@@ -197,7 +197,7 @@ def is_gain(gains: Float64Array, least: float = 1.0) -> bool:
     return bool(np.isfinite(gains).all() and gains.mean() > least * gains.std() / np.sqrt(max(len(gains) - 1, 1)))
 
 
-class Outline:
+class SquareMask:
     """A mask resampled to a pinhole camera that is directed at the bounding ball of the mesh.
 
     Attributes:
@@ -246,7 +246,7 @@ class Silhouettes:
         self.integrator.sample_border_warning = False
         self.params = mi.traverse(self.scene)
 
-    def loss(self, vertices: mi.Float, views: Sequence[Outline], rng: np.random.Generator) -> mi.Float:
+    def loss(self, vertices: mi.Float, views: Sequence[SquareMask], rng: np.random.Generator) -> mi.Float:
         """Return the mean squared difference between silhouettes and masks, with gradients."""
         self.set_vertices(vertices)
         total = mi.Float(0)
@@ -255,7 +255,7 @@ class Silhouettes:
             total += dr.mean(dr.square(shown - view.mask) * view.known)
         return total
 
-    def overlaps(self, vertices: Float64Array, views: Sequence[Outline]) -> Float64Array:
+    def overlaps(self, vertices: Float64Array, views: Sequence[SquareMask]) -> Float64Array:
         """Return the IoU (V,) of silhouette and mask in V views, by pixel coverage, for vertices (N, 3)."""
         self.set_vertices(wrapped(mi.Float, vertices.ravel().astype(np.float32)))
         overlaps = []
@@ -270,7 +270,7 @@ class Silhouettes:
         self.params["mesh.vertex_positions"] = vertices
         self.params.update()
 
-    def render(self, view: Outline, samples: int, seed: int, params: mi.SceneParameters | None = None) -> mi.Float:
+    def render(self, view: SquareMask, samples: int, seed: int, params: mi.SceneParameters | None = None) -> mi.Float:
         """Render the share of each pixel that the mesh covers, (size * size,), with gradients to ``params``."""
         picture = mi.render(self.scene, params, view.sensor, self.integrator, seed=seed, spp=samples, spp_grad=1)
         return picture.array

@@ -20,7 +20,7 @@ from mitsplat.reconstruct.asset_report import write_asset_report
 from mitsplat.reconstruct.fold_repair import edges_through_faces, limit_motion
 from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, reconstruct_asset
 from mitsplat.reconstruct.segment_splats import MaskedView
-from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, Outline, Silhouettes, refine_mesh
+from mitsplat.reconstruct.silhouette_refinement import MeshRefineSettings, Silhouettes, SquareMask, refine_mesh
 from mitsplat.reconstruct.surface import SurfaceSettings
 from tests.conftest import KnownObject, orbit
 from tests.reconstruct.test_reconstruct import SETTINGS
@@ -144,7 +144,7 @@ def test_the_gradient_of_a_silhouette_area_equals_its_closed_form() -> None:
     """A ball of radius r at distance d covers a disc of area A = pi f^2 r^2 / (d^2 - r^2), in pixels."""
     ball = trimesh.creation.icosphere(4)
     camera = Camera.look_at((4, 0, 0), (0, 0, 0), width=96, height=96, fov_x=40)
-    outline = Outline(masked(ball, [camera])[0], np.zeros(3), 1.0, 96)
+    outline = SquareMask(masked(ball, [camera])[0], np.zeros(3), 1.0, 96)
     scene = Silhouettes(ball)
     radius = mi.Float(1)
     dr.enable_grad(radius)
@@ -170,9 +170,9 @@ def test_masks_of_a_distorted_lens_are_undistorted(
     """The object is off-axis, where distortion is largest: a pinhole model would make the error ten times as large."""
     aside = Camera.look_at((0.3, 0, 0.1), (0, 0.05, 0), width=480, height=480, fov_x=50)
     cameras = [aside, replace(aside, distortion=distortion, lens=lens)]
-    pinhole, bent = (Outline(view, np.zeros(3), 0.07, SIZE) for view in masked(truth, cameras, 2))
+    pinhole, bent = (SquareMask(view, np.zeros(3), 0.07, SIZE) for view in masked(truth, cameras, 2))
     known = np.array(pinhole.known) * np.array(bent.known)
-    straight = Outline(replace(masked(truth, cameras[1:], 2)[0], camera=aside), np.zeros(3), 0.07, SIZE)
+    straight = SquareMask(replace(masked(truth, cameras[1:], 2)[0], camera=aside), np.zeros(3), 0.07, SIZE)
     error, taken = (np.abs((np.array(pinhole.mask) - np.array(o.mask)) * known).mean() for o in (bent, straight))
     assert known.mean() > 0.9
     assert error < 0.1 * taken

@@ -208,8 +208,6 @@ def _link_files(folder: Path, out: Path, record: Record) -> None:
 def _source(folder: Path, file: str, record: Record) -> Path:
     """Return a file of a shard's frame."""
     try:
-        if ".." in Path(file).parts:  # the path may leave the other dataset's folder
-            raise InputError(f"files must not be named by .. (got {file})")
         return resolve_inside(folder, file)
     except InputError as error:
         raise InputError(f"{folder}: frame {record['index']}: {error}; render that shard again") from error

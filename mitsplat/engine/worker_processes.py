@@ -21,8 +21,8 @@ from mitsplat.engine.answers import Answer, Failure, Finished, Lost, Result, Sta
 from mitsplat.engine.shared_arrays import SharedArrays
 from mitsplat.errors import MissingResourceError
 from mitsplat.progress import Note
-from mitsplat.runtime.child_process import safe_path_children
-from mitsplat.runtime.device import Device, Gpu, Kind, children_on_gpu, use_shared_device
+from mitsplat.runtime.child_process import changed_environment, safe_path_children
+from mitsplat.runtime.device import Device, Gpu, Kind, gpu_environment, use_shared_device
 from mitsplat.runtime.gpu_memory import VISIBLE_GPUS
 from mitsplat.storage.cache import prepare_caches
 
@@ -101,7 +101,7 @@ class WorkerProcesses(Generic[Result]):
         load = Counter(self._taken.values())
         gpu = min(self._gpus, key=load.__getitem__, default=None)
         arguments = far_end, self._kind, self._threads, self._jobs
-        with children_on_gpu(gpu, **self._environment):
+        with changed_environment({**self._environment, **gpu_environment(gpu)}):
             process = self._start_process(f"mitsplat-{worker}", _work, arguments)
         far_end.close()  # so that the worker's death closes the pipe
         self._workers[worker] = process, pipe
@@ -113,7 +113,7 @@ class WorkerProcesses(Generic[Result]):
     def start_helper(self) -> None:
         """Start a process without a GPU that runs ``prepare`` once. It needs no attention and may die."""
         name = f"mitsplat-helper-{len(self._helpers)}"
-        with children_on_gpu(None, **{VISIBLE_GPUS: ""}):
+        with changed_environment({VISIBLE_GPUS: ""}):
             self._helpers.append(self._start_process(name, _help, (self._jobs,)))
 
     def _start_process(self, name: str, target: Callable[..., None], arguments: tuple[object, ...]) -> BaseProcess:

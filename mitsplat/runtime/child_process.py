@@ -59,23 +59,34 @@ def python_environment(changes: Mapping[str, str] | None = None) -> dict[str, st
 
 
 @contextmanager
+def changed_environment(changes: Mapping[str, str]) -> Iterator[None]:
+    """Change environment variables of this process in this context, for the processes that it starts."""
+    kept = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in kept.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
 def safe_path_children() -> Iterator[None]:
     """Put processes that :mod:`multiprocessing` and libraries start in this context into safe-path mode.
 
     Such processes inherit this process's environment and import path, so that both are changed within the context. An
     empty entry of the path means the current folder: that of a prompt, of a notebook or of ``python -c``.
     """
-    kept, path = os.environ.get(SAFE_PATH), list(sys.path)
-    os.environ[SAFE_PATH] = "1"
+    path = list(sys.path)
     sys.path[:] = [entry for entry in path if entry]
     try:
-        yield
+        with changed_environment({SAFE_PATH: "1"}):
+            yield
     finally:
         sys.path[:] = path
-        if kept is None:
-            del os.environ[SAFE_PATH]
-        else:
-            os.environ[SAFE_PATH] = kept
 
 
 def leave_current_folder() -> None:

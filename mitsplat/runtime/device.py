@@ -15,8 +15,7 @@ import ctypes
 import os
 import re
 import uuid
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -186,25 +185,9 @@ def check_device_name(device: str) -> str:
     return device
 
 
-def gpu_environment(gpu: Gpu) -> dict[str, str]:
-    """Return the environment variables of a process for which this GPU is the only visible one."""
-    return {VISIBLE_GPUS: gpu.id} if gpu.id else {}
-
-
-@contextmanager
-def children_on_gpu(gpu: Gpu | None, **variables: str) -> Iterator[None]:
-    """Start processes in this context with only this GPU visible (unchanged if None), and with more variables."""
-    changes = variables if gpu is None else variables | gpu_environment(gpu)
-    kept = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in kept.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def gpu_environment(gpu: Gpu | None) -> dict[str, str]:
+    """Return the environment variables of a process for which this GPU is the only visible one; None changes none."""
+    return {VISIBLE_GPUS: gpu.id} if gpu is not None and gpu.id else {}
 
 
 def visible_gpus() -> tuple[Gpu, ...] | MissingPrerequisite:

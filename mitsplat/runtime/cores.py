@@ -10,4 +10,4 @@ def usable_cores() -> int:
 
     More threads than these cores only increase memory use.
     """
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))

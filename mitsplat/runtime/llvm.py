@@ -30,9 +30,8 @@ def find_bundled_llvm() -> Path | None:
     """Return the path of libLLVM that a wheel installed in this environment's ``lib`` folder, or None."""
     folders = {Path(sysconfig.get_path("data")) / "lib", Path(sysconfig.get_path("platlib")).parents[1]}
     for folder in sorted(folders):
-        for name in ("libLLVM.so", "libLLVM.dylib"):
-            if (folder / name).exists():
-                return folder / name
+        if (folder / "libLLVM.so").exists():
+            return folder / "libLLVM.so"
     return None
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import resource
 import statistics
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -261,7 +260,7 @@ class _RenderJob:
         render = _splats_renderer(self) if _is_splats(self.path) else _scene_renderer(self)
         views = [render(number) for number in (0, *range(self.frames))][1:]
         pictures, instances, seconds, estimates = zip(*views, strict=True)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2 ** (30 if sys.platform == "darwin" else 20)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # in KiB
         return _StepResult(np.stack(pictures), np.stack(instances), statistics.median(seconds), peak, max(estimates))
 
 

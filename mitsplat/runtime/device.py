@@ -107,7 +107,12 @@ def use_device(device: str | Device) -> Device:
     """
     found = find_device(device)
     if not found.is_usable_here:
-        raise _late_device_error(str(device), found.gpus[0])
+        gpu = found.gpus[0]
+        raise LateDeviceError(
+            f"{device} must be the first visible GPU when mitsplat is imported: set {VISIBLE_GPUS}={gpu.id} before the "
+            "import, and use the device cuda",
+            {**gpu_environment(gpu), GPU_NUMBER: str(device).partition(":")[2]},
+        )
     choose_variant(VARIANTS[found.kind == "cuda"])
     return found
 
@@ -164,14 +169,6 @@ def find_device(device: str | Device) -> Device:
         numbers = f"cuda:0 to cuda:{len(gpus) - 1}" if len(gpus) > 1 else "cuda:0"
         raise InputError(f"device must be one of the visible GPUs, {numbers} (got {text})")
     return Device("cuda", (gpus[int(which)],))
-
-
-def _late_device_error(text: str, gpu: Gpu) -> LateDeviceError:
-    return LateDeviceError(
-        f"{text} must be the first visible GPU when mitsplat is imported: set {VISIBLE_GPUS}={gpu.id} before the "
-        "import, and use the device cuda",
-        {**gpu_environment(gpu), GPU_NUMBER: text.partition(":")[2]},
-    )
 
 
 def check_device_name(device: str) -> str:

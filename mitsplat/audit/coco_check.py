@@ -31,7 +31,7 @@ from mitsplat.audit.decoded_frame import DecodedFrame, DecodedInstance, bounds_o
 from mitsplat.audit.picture_check import segment_picture
 from mitsplat.images.masks import Box, decode_rle
 from mitsplat.storage.files import JsonObject
-from mitsplat.storage.json_stream import read_lists
+from mitsplat.storage.json_stream import read_entries
 
 MAX_COCO_BYTES = 32 << 20
 """Maximum size of a file that is also opened by pycocotools, which needs ten times as much memory."""
@@ -59,7 +59,7 @@ class AnnotationFile:
 
     def _read(self, name: str, index: str) -> Iterator[tuple[int, JsonObject]]:
         """Yield the elements of a list by frame index; store the categories while the annotations are read."""
-        for key, value in read_lists(self._path):
+        for key, value in read_entries(self._path, split_lists=True):
             if key == name:
                 self.counts[name] += 1
                 yield int(value[index]), value
@@ -234,7 +234,7 @@ class PosesCheck(DatasetCheck):
         self._frames = EntryCursor(file, self._read(root / file))
 
     def _read(self, path: Path) -> Iterator[tuple[int, JsonObject]]:
-        for key, value in read_lists(path):
+        for key, value in read_entries(path, split_lists=True):
             if key == "frames":
                 yield int(value["id"]), value
             elif key == "classes" and len(self._classes) <= len(self._content["classes"]):

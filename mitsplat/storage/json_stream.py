@@ -98,28 +98,13 @@ class EntriesFile:
         self._file.discard()
 
 
-def read_lists(path: Path) -> Iterator[tuple[str, Any]]:
-    """Yield the elements of an object's lists, and its other values, each with its key.
+def read_entries(path: Path, *, split_lists: bool = False) -> Iterator[tuple[str, Any]]:
+    """Yield the entries of an object; with ``split_lists``, the elements of its lists one by one, each with its key.
 
     Raises:
         ValueError: If the file is not JSON or not an object.
         OSError: If it cannot be read.
     """
-    yield from _read_object(path, lists=True)
-
-
-def read_entries(path: Path) -> Iterator[tuple[str, Any]]:
-    """Yield the entries of an object.
-
-    Raises:
-        ValueError: If the file is not JSON or not an object.
-        OSError: If it cannot be read.
-    """
-    yield from _read_object(path, lists=False)
-
-
-def _read_object(path: Path, *, lists: bool) -> Iterator[tuple[str, Any]]:
-    """Yield the values of an object with their keys; with ``lists``, the elements of its lists one by one."""
     with io.TextIOWrapper(open_regular(path), encoding="utf-8") as file:
         window = _Window(file)
         for _ in _items(window, "{", "}"):
@@ -127,7 +112,7 @@ def _read_object(path: Path, *, lists: bool) -> Iterator[tuple[str, Any]]:
             if not isinstance(key, str):
                 raise ValueError(f"a key must be a string (got {str(key)[:40]})")
             window.expect(":")
-            if lists and window.peek() == "[":
+            if split_lists and window.peek() == "[":
                 for _ in _items(window, "[", "]"):
                     yield key, window.value()
             else:

@@ -17,7 +17,7 @@ from mitsplat.formats import bop
 from mitsplat.formats.registry import Catalogue, CollectionWriter
 from mitsplat.storage import json_stream
 from mitsplat.storage.files import GrowingFile
-from mitsplat.storage.json_stream import EntriesFile, ListsFile, read_entries, read_lists
+from mitsplat.storage.json_stream import EntriesFile, ListsFile, read_entries
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
@@ -51,7 +51,7 @@ def test_streamed_lists_equal_those_of_json(
     expected = [
         (key, element) for key, value in whole.items() for element in (value if isinstance(value, list) else [value])
     ]
-    assert list(read_lists(tmp_path / "a.json")) == expected
+    assert list(read_entries(tmp_path / "a.json", split_lists=True)) == expected
 
 
 @KEPT
@@ -76,9 +76,9 @@ def test_streamed_entries_equal_those_of_json(tmp_path: Path, entries: dict[str,
 def test_text_that_is_not_a_json_object_is_refused(tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(json_stream, "_BLOCK", 1 << 16)
     (tmp_path / "a.json").write_text(text)
-    for read in (read_lists, read_entries):
+    for split_lists in (True, False):
         with pytest.raises(ValueError, match=r"."):
-            list(read(tmp_path / "a.json"))
+            list(read_entries(tmp_path / "a.json", split_lists=split_lists))
 
 
 def test_a_discarded_file_leaves_the_earlier_one(tmp_path: Path) -> None:

@@ -85,8 +85,9 @@ def write_folds(root: str | Path, folds: int) -> list[Fold]:
         for file in files:
             cleanup.callback(file.discard)
         for record in records:
+            layout: int = record["layout"]
             for fold, name in enumerate(names) if record["split"] != "test" else ():
-                key = name, "val" if fold_of[_first(record, first)] == fold else "train"
+                key = name, "val" if fold_of[first.get(layout, layout)] == fold else "train"
                 for image_list in lists[key]:
                     image_list.write(f"./{image_file(record)}\n")
                 if coco_files:
@@ -118,12 +119,6 @@ def _first_of_equal(root: Path, records: Iterable[Record]) -> dict[int, int]:
     return first
 
 
-def _first(record: Record, first: Mapping[int, int]) -> int:
-    """Return the first layout with the poses of a record's layout."""
-    layout: int = record["layout"]
-    return first.get(layout, layout)
-
-
 def _count(records: Iterable[Record], first: Mapping[int, int]) -> tuple[dict[int, Counter[str]], Counter[int]]:
     """Return the number of instances by class, and the number of images, of each layout; the test split is left out.
 
@@ -133,7 +128,7 @@ def _count(records: Iterable[Record], first: Mapping[int, int]) -> tuple[dict[in
     for record in records:
         if record["split"] != "test":
             classes = (label["class"] for label in record["labels"]["instances"])
-            layout = _first(record, first)
+            layout = first.get(record["layout"], record["layout"])
             layouts.setdefault(layout, Counter()).update(classes)
             images[layout] += 1
     return layouts, images

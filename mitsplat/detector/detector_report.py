@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping, Sequence
 
-import cv2
 import numpy as np
 
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, Sample
@@ -14,7 +13,7 @@ from mitsplat.detector.losses import ERROR_KINDS
 from mitsplat.detector.scores import CONFIDENCE, IOU, MAX_DETECTIONS, AveragePrecision, Confusion, Detection
 from mitsplat.images.masks import Silhouette, decode_rle
 from mitsplat.labels.overlay import class_colour
-from mitsplat.pages.html import inline_image, make_charts, make_page, make_section, make_table, mask_path
+from mitsplat.pages.html import make_charts, make_page, make_section, make_table, mask_path, shrunk_image
 from mitsplat.pages.svg_charts import bars, curves
 from mitsplat.storage.files import JsonObject
 
@@ -167,9 +166,6 @@ def worst_images(confusion: Confusion) -> list[int]:
 
 
 def _picture(sample: Sample, shown: Sequence[JsonObject], class_names: Sequence[str], what: str) -> str:
-    image = read_upright(sample.path)
-    scale = min(1.0, _THUMBNAIL / sample.width)
-    size = max(1, round(sample.width * scale)), max(1, round(sample.height * scale))
     unit, marks, names = sample.width / _THUMBNAIL, [], []
     for entry in shown:
         index = entry["category_id"] - 1
@@ -185,7 +181,7 @@ def _picture(sample: Sample, shown: Sequence[JsonObject], class_names: Sequence[
             f"{html.escape(name)}</text>"
         )
     text = html.escape(f"{sample.name}, {what}: {len(shown)}", quote=True)
-    source = inline_image(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    source = shrunk_image(np.ascontiguousarray(read_upright(sample.path)[..., ::-1]), _THUMBNAIL)
     return (
         f'<div class="picture"><img alt="{text}" src="{source}"><svg aria-hidden="true" '
         f'viewBox="0 0 {sample.width} {sample.height}">{"".join(marks + names)}</svg></div>'

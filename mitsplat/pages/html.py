@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from mitsplat.arrays import AnyArray, ByteImage
+from mitsplat.arrays import ByteImage
 from mitsplat.images.masks import Silhouette
 from mitsplat.storage.files import write_text
 
@@ -58,17 +58,13 @@ def make_figure(alt: str, caption: str, source: str) -> str:
     return f'<figure><img alt="{alt}" src="{source}"><figcaption>{caption}</figcaption></figure>'
 
 
-def inline_image(pixels: AnyArray) -> str:
-    """Encode a picture in blue, green, red order (H, W, 3) as a data URL."""
-    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 82])
-    return f"data:image/jpeg;base64,{base64.b64encode(bytes(data)).decode('ascii')}"
-
-
 def shrunk_image(picture: ByteImage, width: int) -> str:
     """Encode an RGB picture (H, W, 3) as a data URL, at most ``width`` px wide."""
     scale = min(1.0, width / picture.shape[1])
     size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
-    return inline_image(cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR))
+    pixels = cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    return f"data:image/jpeg;base64,{base64.b64encode(bytes(data)).decode('ascii')}"
 
 
 def rgb_image(values: npt.NDArray[np.floating], width: int) -> str:

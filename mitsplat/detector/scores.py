@@ -168,10 +168,12 @@ def match_boxes(found: Sequence[Sequence[float]], labelled: Sequence[Sequence[fl
     pairs: dict[int, int] = {}
     if not labelled:
         return pairs
-    for d, row in enumerate(overlaps(found, labelled)):
-        best = int(np.where(np.isin(np.arange(len(labelled)), list(pairs.values())), -1, row).argmax())
-        if row[best] >= IOU and best not in pairs.values():
+    free = overlaps(found, labelled)
+    for d, row in enumerate(free):
+        best = int(row.argmax())
+        if row[best] >= IOU:
             pairs[d] = best
+            free[:, best] = 0
     return pairs
 
 

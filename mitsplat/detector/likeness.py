@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -192,7 +193,8 @@ def compare_with_photographs(
     )
     only_boxes = frozenset(i.class_index for one in ours + theirs for i in one.instances if not (i.has_mask or i.crowd))
     sides: tuple[_Values, _Values] = defaultdict(list), defaultdict(list)
-    hues: tuple[_HueSums, _HueSums] = defaultdict(_zero_hue_sums), defaultdict(_zero_hue_sums)
+    no_hues = partial(np.zeros, _HUE_BINS)
+    hues: tuple[_HueSums, _HueSums] = defaultdict(no_hues), defaultdict(no_hues)
     for number, sample in enumerate(ours + theirs):
         _measure(sample, number, size, only_boxes, sides[number >= len(ours)], hues[number >= len(ours)])
         if progress is not None:
@@ -273,10 +275,6 @@ def _equal_sizes(ratios: Sequence[float], size: int) -> tuple[int | None, tuple[
         return None, None
     least, middle, most = (max(round(size * ratio / STRIDE), 1) * STRIDE for ratio in np.quantile(ratios, [0, 0.5, 1]))
     return middle, (least, most)
-
-
-def _zero_hue_sums() -> Float64Array:
-    return np.zeros(_HUE_BINS)
 
 
 def _hue_histogram(pixels: ByteImage) -> Float64Array:

@@ -11,7 +11,7 @@ import os
 import re
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from pickle import UnpicklingError
@@ -104,19 +104,13 @@ def check_torchvision() -> None:
 
 def versions() -> dict[str, str]:
     """Return the versions of the libraries that affect the result of a training."""
-    names = ("mitsplat", "torch", "torchvision", "numpy")
-    found = {name: importlib.metadata.version(name) for name in names if _is_installed(name)}
     import ultralytics
 
+    found = {}
+    for name in ("mitsplat", "torch", "torchvision", "numpy"):
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
     return found | {"ultralytics": str(ultralytics.__version__)}
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 def torch_device(device: str) -> tuple[str, str]:
@@ -209,6 +203,12 @@ def linked_weights(path: Path) -> Iterator[str]:
         yield str(link)
 
 
+def check_weights_exist(path: Path) -> None:
+    """Raise InputError unless the path is an existing file with the suffix of weights."""
+    if not path.is_file() or path.suffix != ".pt":
+        raise InputError(f"--weights must be an existing weights file of Ultralytics (.pt) (got {path})")
+
+
 def load_weights(path: Path) -> torch.nn.Module:
     """Load the network of a weights file.
 
@@ -217,8 +217,7 @@ def load_weights(path: Path) -> torch.nn.Module:
     """
     from ultralytics.nn.tasks import load_checkpoint
 
-    if not path.is_file() or path.suffix != ".pt":
-        raise InputError(f"--weights must be an existing weights file of Ultralytics (.pt) (got {path})")
+    check_weights_exist(path)
     try:
         with linked_weights(path) as name:
             return load_checkpoint(name)[0]

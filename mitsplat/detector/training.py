@@ -24,7 +24,14 @@ from pathlib import Path
 
 from mitsplat.detector.labelled_sets.labelled_set import LabelledSet, check_masks, match_classes, reorder_classes
 from mitsplat.detector.labelled_sets.set_reading import read_set
-from mitsplat.detector.libraries import check_weights, load_libraries, read_network, torch_device, versions
+from mitsplat.detector.libraries import (
+    check_weights,
+    check_weights_exist,
+    load_libraries,
+    read_network,
+    torch_device,
+    versions,
+)
 from mitsplat.detector.mix import plan_images
 from mitsplat.detector.photo_tiles import cut_photographs
 from mitsplat.detector.train_settings import TrainSettings
@@ -106,8 +113,8 @@ def train_detector(
         raise InputError("training needs at least one dataset (got none)")
     if settings.real_size is not None and real is None:
         raise InputError("--real-size needs photographs: give them with --real")
-    if settings.weights is not None and not settings.weights.is_file():
-        raise InputError(f"--weights must be an existing weights file of Ultralytics (.pt) (got {settings.weights})")
+    if settings.weights is not None:
+        check_weights_exist(settings.weights)
     if not (out / RUN_FILE).is_file():
         check_folder(out, "a run")
     load_libraries()

@@ -12,6 +12,7 @@ import numpy as np
 from mitsplat.arrays import ByteImage
 from mitsplat.dataset.records.record_schema import Records, read_content
 from mitsplat.errors import InputError
+from mitsplat.formats.coco import image_file
 from mitsplat.images.picture_files import read_picture
 from mitsplat.labels.labels import Labels
 from mitsplat.labels.overlay import class_colour, draw_labels
@@ -104,9 +105,8 @@ class DatasetIndex:
             InputError: If the image is missing, unreadable, or not a file of the dataset.
         """
         record = self.record(index)
-        name = next(file for file in record["files"] if file.startswith("images/"))
         try:
-            path = resolve_inside(self._root, name)
+            path = resolve_inside(self._root, image_file(record))
         except InputError as error:
             raise InputError(f"{self._root}: frame {index}: {error}") from error
         stored = read_picture(path, cv2.IMREAD_COLOR)

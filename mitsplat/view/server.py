@@ -14,7 +14,6 @@ from mitsplat.view.page import Address, Page
 
 if TYPE_CHECKING:
     from mitsplat.view.scene_page import ScenePage
-    from mitsplat.view.static_pages import StaticPage
 
 Kind = Literal["scene", "asset", "capture", "dataset", "splats"]
 
@@ -49,35 +48,41 @@ def serve(
     kind = kind_of(path)
     page = Page(path.name, address or Address(), gaussians=gaussians)
     try:
-        shown = _fill_page(page, path, kind, allow_outside)
+        scene_page = _fill_page(page, path, kind, allow_outside)
         try:
             ready(page.url)
             while True:
                 time.sleep(_CHECK_INTERVAL)
-                shown.check()
+                if scene_page is not None:
+                    scene_page.check()
         except KeyboardInterrupt:
             return
         finally:
-            shown.close()
+            if scene_page is not None:
+                scene_page.close()
     finally:
         page.close()
 
 
-def _fill_page(page: Page, path: Path, kind: Kind, allow_outside: bool) -> ScenePage | StaticPage:
-    """Fill the page with the content of a path; only the modules of its kind are imported, for a fast start."""
+def _fill_page(page: Page, path: Path, kind: Kind, allow_outside: bool) -> ScenePage | None:
+    """Fill the page with the content of a path, and return the page of a scene, which follows changes of its file.
+
+    Only the modules of the kind are imported, for a fast start.
+    """
     if kind == "scene":
         from mitsplat.view.scene_page import ScenePage  # fast start: renders, physics
 
         return ScenePage(page, path, allow_outside=allow_outside)
     from mitsplat.view import static_pages  # fast start: datasets and captures
 
-    pages = {
-        "asset": static_pages.AssetPage,
+    fill: dict[Kind, Callable[[Page, Path], object]] = {
+        "asset": static_pages.show_asset,
         "capture": static_pages.CapturePage,
         "dataset": static_pages.DatasetPage,
-        "splats": static_pages.SplatsPage,
+        "splats": static_pages.show_splats,
     }
-    return pages[kind](page, path)
+    fill[kind](page, path)
+    return None
 
 
 def kind_of(path: Path) -> Kind:

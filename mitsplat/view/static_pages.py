@@ -40,53 +40,39 @@ _CLICKS = {
 _COLOURS = {_PICK: (255, 210, 0), _PICK_NOT: (60, 120, 255), _REMOVE: (255, 60, 60)}
 
 
-class StaticPage:
-    """Page with static content."""
-
-    def close(self) -> None:
-        """Do nothing; there is nothing to stop."""
-
-    def check(self) -> None:
-        """Do nothing; static content has no later errors."""
-
-
-class AssetPage(StaticPage):
-    """Page of an asset: its splats, mesh, convex pieces and keypoints."""
-
-    def __init__(self, page: Page, folder: Path) -> None:
-        asset = Asset.load(folder)
-        page.show(asset_parts(asset))
-        page.look_around()
-        extent = asset.splats.bounds if asset.mesh is None else asset.mesh.bounds
-        size = " × ".join(f"{side:.3g}" for side in np.ptp(extent, axis=0))
-        facts = [
-            f"**{asset.kind}**, class {asset.class_name}",
-            f"{len(asset.splats)} Gaussians, spherical harmonics of degree {asset.splats.sh_degree}",
-            f"{size} m" if asset.units == "metre" else f"{size}, of unknown units",
-            "no mesh" if asset.mesh is None else f"mesh of {len(asset.mesh.faces)} faces",
-            f"{len(asset.pieces)} convex pieces",
-            *(f"look: {finding}" for finding in asset.check()),
-        ]
-        page.caption("\n\n".join(facts))
+def show_asset(page: Page, folder: Path) -> None:
+    """Show an asset: its splats, mesh, convex pieces and keypoints."""
+    asset = Asset.load(folder)
+    page.show(asset_parts(asset))
+    page.look_around()
+    extent = asset.splats.bounds if asset.mesh is None else asset.mesh.bounds
+    size = " × ".join(f"{side:.3g}" for side in np.ptp(extent, axis=0))
+    facts = [
+        f"**{asset.kind}**, class {asset.class_name}",
+        f"{len(asset.splats)} Gaussians, spherical harmonics of degree {asset.splats.sh_degree}",
+        f"{size} m" if asset.units == "metre" else f"{size}, of unknown units",
+        "no mesh" if asset.mesh is None else f"mesh of {len(asset.mesh.faces)} faces",
+        f"{len(asset.pieces)} convex pieces",
+        *(f"look: {finding}" for finding in asset.check()),
+    ]
+    page.caption("\n\n".join(facts))
 
 
-class SplatsPage(StaticPage):
-    """Page of a splat file; units are unknown, and the usual up axis of the format is assumed."""
-
-    def __init__(self, page: Page, path: Path) -> None:
-        splats = Splats.load(path)
-        page.show([ShownPart("/splats/file", ShownSplats(splats))])
-        axes = get_args(Axis)
-        up = page.gui.add_dropdown("up axis", axes, initial_value=default_up_axis(path))
-        up.on_update(lambda _: page.look_around(up.value) if up.value in axes else None)
-        page.look_around(up.value)
-        size = " × ".join(f"{side:.3g}" for side in np.ptp(splats.bounds, axis=0)) if len(splats) else "nothing"
-        page.caption(
-            f"{len(splats)} Gaussians, spherical harmonics of degree {splats.sh_degree}\n\n{size} in units of the file"
-        )
+def show_splats(page: Page, path: Path) -> None:
+    """Show a splat file; units are unknown, and the usual up axis of the format is assumed."""
+    splats = Splats.load(path)
+    page.show([ShownPart("/splats/file", ShownSplats(splats))])
+    axes = get_args(Axis)
+    up = page.gui.add_dropdown("up axis", axes, initial_value=default_up_axis(path))
+    up.on_update(lambda _: page.look_around(up.value) if up.value in axes else None)
+    page.look_around(up.value)
+    size = " × ".join(f"{side:.3g}" for side in np.ptp(splats.bounds, axis=0)) if len(splats) else "nothing"
+    page.caption(
+        f"{len(splats)} Gaussians, spherical harmonics of degree {splats.sh_degree}\n\n{size} in units of the file"
+    )
 
 
-class CapturePage(StaticPage):
+class CapturePage:
     """Page of a capture: points, cameras, and the selected photo with its mask; a click picks an object."""
 
     def __init__(self, page: Page, folder: Path) -> None:
@@ -190,7 +176,7 @@ class CapturePage(StaticPage):
         self._page.show_picture(image, f"{_literal(photo.name)}: observes {len(photo.seen)} points{masked}")
 
 
-class DatasetPage(StaticPage):
+class DatasetPage:
     """Page of a dataset: images with their labels, and a filter."""
 
     def __init__(self, page: Page, folder: Path) -> None:

@@ -17,7 +17,7 @@ from mitsplat.errors import InputError
 from mitsplat.view.dataset_index import DatasetIndex, Filter
 from mitsplat.view.page import Address, Page, splat_arrays
 from mitsplat.view.server import kind_of
-from mitsplat.view.static_pages import AssetPage, CapturePage, DatasetPage, SplatsPage, photo_picture
+from mitsplat.view.static_pages import CapturePage, DatasetPage, photo_picture, show_asset, show_splats
 from tests.capture.isolation.balls import THINGS, capture_of_balls
 from tests.conftest import KnownObject, box_asset
 
@@ -109,7 +109,7 @@ def test_the_page_of_a_dataset_steps_through_filtered_images(page, clean):
 
 def test_the_page_of_an_asset_shows_its_properties(page, tmp_path):
     box_asset("nut").save(tmp_path / "nut")
-    AssetPage(page, tmp_path / "nut")
+    show_asset(page, tmp_path / "nut")
     assert sorted(page._shown) == ["/meshes/nut", "/pieces/nut/0", "/splats/nut"]
     assert "12 Gaussians" in page._caption.content
     assert "0.02 × 0.03 × 0.01 m" in page._caption.content
@@ -176,7 +176,7 @@ def test_clicks_on_a_capture_pick_objects(page, tmp_path):
 
 def test_the_page_of_a_splat_file_shows_its_gaussians(page, tmp_path):
     box_asset("nut").splats.save(tmp_path / "nut.ply")
-    SplatsPage(page, tmp_path / "nut.ply")
+    show_splats(page, tmp_path / "nut.ply")
     assert list(page._shown) == ["/splats/file"]
     camera = page._server.initial_camera
     assert camera.up[1] < -0.5 and camera.position[1] < 0  # most files have -y up; view from above

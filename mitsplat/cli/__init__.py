@@ -24,7 +24,7 @@ from typer.core import TyperGroup
 from mitsplat.cli import assets, captures, datasets, detectors, exports, fault, inspection, lights, machine, photographs
 from mitsplat.cli.interrupt import handle_interrupts
 from mitsplat.cli.options import parse_strictly
-from mitsplat.errors import LateDeviceError, exit_status, sentence_of
+from mitsplat.errors import LateDeviceError
 from mitsplat.runtime.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.storage.file_kinds import check_path_encoding
 from mitsplat.version import __version__
@@ -110,9 +110,9 @@ def main(args: Sequence[str] | None = None) -> None:
         if args is None and isinstance(error, LateDeviceError):
             command = python_command(*sys.orig_argv[1:])
             os.execve(command[0], command, python_environment(error.environment))
-        status = exit_status(error)
-        typer.echo(f"mitsplat: {fault.report_fault(error) if status is None else sentence_of(error)}", err=True)
-        sys.exit(fault.STATUS if status is None else status)
+        status, sentence = fault.outcome_of(error)
+        typer.echo(f"mitsplat: {sentence}", err=True)
+        sys.exit(status)
 
 
 def _show_version(wanted: bool) -> None:

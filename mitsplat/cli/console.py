@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NoReturn
 import typer
 
 from mitsplat.cli import fault
-from mitsplat.errors import exit_status, sentence_of
+from mitsplat.errors import INTERRUPTED, exit_status
 from mitsplat.progress import TIME_NOTE, Progress
 
 if TYPE_CHECKING:
@@ -65,20 +65,14 @@ def command_log(
     try:
         yield lambda: nullcontext(progress)
     except BaseException as error:
-        status = exit_status(error)
-        if isinstance(error, typer.Exit) or (status is None and not isinstance(error, Exception)):
+        if isinstance(error, typer.Exit) or (exit_status(error) is None and not isinstance(error, Exception)):
             raise
-        if status == 130:
-            emit(
-                "failed",
-                status=130,
-                error=type(error).__name__,
-                message="interrupted: run the command again to continue",
-            )
-            raise
-        sentence = fault.report_fault(error) if status is None else sentence_of(error)
-        status = fault.STATUS if status is None else status
+        status, sentence = fault.outcome_of(error)
+        if status == INTERRUPTED:
+            sentence = "interrupted: run the command again to continue"
         emit("failed", status=status, error=type(error).__name__, message=sentence)
+        if status == INTERRUPTED:
+            raise
         raise typer.Exit(status) from error
     emit("finished", status=0)
 

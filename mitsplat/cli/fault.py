@@ -13,6 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from mitsplat.errors import exit_status, sentence_of
 from mitsplat.storage.cache import cache_folder
 from mitsplat.version import __version__
 
@@ -28,6 +29,12 @@ _FOLDERS: tuple[Callable[[], Path], ...] = (
     lambda: Path(tempfile.gettempdir()),
     Path.cwd,
 )
+
+
+def outcome_of(error: BaseException) -> tuple[int, str]:
+    """Return the exit status and the sentence of an error; an unexpected error is written to a log file."""
+    status = exit_status(error)
+    return (STATUS, report_fault(error)) if status is None else (status, sentence_of(error))
 
 
 def report_fault(error: BaseException) -> str:

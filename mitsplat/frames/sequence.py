@@ -70,7 +70,9 @@ def render_frames(
     indices = _frame_indices(scene, frames, layouts, cameras)
     parts: tuple[object, ...] = (indices, layouts, cameras)
     total = min((len(part) for part in parts if isinstance(part, Sized)), default=None)
-    scene = with_unlimited_layouts(scene)
+    # More layouts do not change the first frames.
+    output = scene.spec.output.model_copy(update={"layouts": _UNLIMITED_LAYOUTS})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"output": output}))
     with Renderer(scene, quality=quality) as renderer:
         if layouts is None and cameras is None:
             for index in _with_progress_bar(indices, total, progress):
@@ -109,12 +111,6 @@ def _frame_indices(
             if isinstance(given, Sized) and len(given) < len(indices):
                 raise InputError(f"{name} must have one item for each of the {len(indices)} frames (got {len(given)})")
     return indices
-
-
-def with_unlimited_layouts(scene: Scene) -> Scene:
-    """Return the scene with a practically unlimited number of layouts; its first frames do not change."""
-    output = scene.spec.output.model_copy(update={"layouts": _UNLIMITED_LAYOUTS})
-    return replace(scene, spec=scene.spec.model_copy(update={"output": output}))
 
 
 def _next_view(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None, Camera | None]:

@@ -139,14 +139,14 @@ def _make_here(
             yield made
 
 
-def run_in_process(make: MakeFrame[Result], device: Device | None = None) -> Generator[Result]:
-    """Call ``make`` for frame 0 in a separate process and yield the result.
+def run_in_process(make: MakeFrame[Result], device: Device | None = None) -> Result:
+    """Call ``make`` for frame 0 in a separate process and return the result.
 
     Raises:
         InputError, MissingResourceError, FrameError, LostWorkersError: As :func:`run_frames`.
     """
-    with closing(WorkerProcesses(make, device)) as pool:
-        yield from run_pool(pool, {0: [0]}, 1, discard_note)
+    with closing(WorkerProcesses(make, device)) as pool, closing(run_pool(pool, {0: [0]}, 1, discard_note)) as results:
+        return next(results)
 
 
 def affordable_workers(memory: WorkerMemory, device: Device | None = None) -> int:

@@ -7,7 +7,6 @@ import importlib
 import re
 import tempfile
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -210,12 +209,10 @@ def render_apart(path: Path, out: Path, *, allow_outside: bool = False, device: 
         InputError: As in :func:`render_xml`, or if the process crashes.
         MissingResourceError: If the device cannot be used, or its memory does not suffice.
     """
-    job = _RenderOne(path, out, allow_outside)
-    with closing(run_in_process(job, device)) as results:
-        try:
-            return next(results)
-        except LostWorkersError as error:
-            raise InputError(f"{path}: Mitsuba's process ended at a file that the scene names ({error})") from error
+    try:
+        return run_in_process(_RenderOne(path, out, allow_outside), device)
+    except LostWorkersError as error:
+        raise InputError(f"{path}: Mitsuba's process ended at a file that the scene names ({error})") from error
 
 
 @dataclass(frozen=True)

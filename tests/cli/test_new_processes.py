@@ -296,7 +296,7 @@ class Broken:
 
 def broken(*args, **kwargs):
     from mitsplat.engine.pool import run_in_process
-    next(run_in_process(Broken()))
+    run_in_process(Broken())
 
 if __name__ == "__main__":
     dataset.write_dataset = broken

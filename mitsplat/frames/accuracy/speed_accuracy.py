@@ -12,7 +12,6 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
@@ -266,13 +265,12 @@ class _RenderJob:
 
 def _run_job(job: _RenderJob, device: Device) -> _StepResult:
     """Run a job in a process of its own."""
-    with closing(run_in_process(job, device)) as results:
-        try:
-            return next(results)
-        except LostWorkersError as error:
-            raise MissingResourceError(
-                f"{job.path}: the process of step '{job.step.name}' died, possibly because memory is exhausted"
-            ) from error
+    try:
+        return run_in_process(job, device)
+    except LostWorkersError as error:
+        raise MissingResourceError(
+            f"{job.path}: the process of step '{job.step.name}' died, possibly because memory is exhausted"
+        ) from error
 
 
 View = tuple[Float32Array, npt.NDArray[np.uint16], float, float]

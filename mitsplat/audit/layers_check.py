@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import OpenEXR
@@ -17,7 +17,7 @@ from mitsplat.audit.dataset_check import DatasetCheck, Violations
 from mitsplat.audit.decoded_frame import DecodedFrame
 from mitsplat.audit.picture_check import read_16_bits
 from mitsplat.images.exr_header import check_exr_header
-from mitsplat.storage.files import JsonObject
+from mitsplat.storage.files import JsonObject, read_regular
 
 _FLOW_TOLERANCE = 0.02
 """Tolerance of optical flow for single precision and lens models [px]."""
@@ -78,8 +78,8 @@ class LayersCheck(DatasetCheck):
             return
         if file not in before.record["files"] or not (before.root / file).is_file():
             return
-        flow = cv2.readOpticalFlow(str(before.root / file))
-        if flow is None or flow.shape[:2] != depth.shape:
+        flow = _read_flow(before.root / file, before.size)
+        if flow is None:
             yield file, "cannot be read as optical flow of the frame's size"
             return
         check = _FlowCheck(before, frame, depth, step, flow)
@@ -174,6 +174,23 @@ class _FlowCheck:
         unknown = np.flatnonzero(wrong & ~is_stated)
         wrong[unknown[self._after.has_no_pixel(end[unknown])]] = False
         return wrong
+
+
+def _read_flow(path: Path, size: tuple[int, int]) -> AnyArray | None:
+    """Read optical flow in Middlebury's format, shape (H, W, 2); return None if it is not of this width and height.
+
+    OpenCV crashes on negative sizes in the header.
+    """
+    width, height = size
+    header = b"PIEH" + struct.pack("<ii", width, height)
+    length = 2 * width * height
+    try:
+        data = read_regular(path, len(header) + 4 * length)
+    except (OSError, ValueError):
+        return None
+    if not data.startswith(header) or len(data) < len(header) + 4 * length:
+        return None
+    return np.frombuffer(data, "<f4", length, len(header)).reshape(height, width, 2)
 
 
 def _has_unlabelled_motion(frame: DecodedFrame) -> bool:

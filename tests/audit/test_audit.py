@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -426,6 +427,14 @@ def test_permuted_class_names_are_violations(dataset: Path) -> None:
     path = dataset / "data.yaml"
     path.write_text(path.read_text().replace("bolt", "x").replace("nut", "bolt").replace("x", "nut"))
     assert [file for file, _ in audit_dataset(dataset).violations] == ["data.yaml"]
+
+
+@pytest.mark.parametrize("size", [(-1, -1), (2**31 - 1, 2**31 - 1), (4, 4)])
+def test_flow_of_another_size_is_a_violation(dataset: Path, size: tuple[int, int]) -> None:
+    """OpenCV crashes on negative sizes, and allocates memory for the size in the header."""
+    file = "flow/train/000000.flo"
+    (dataset / file).write_bytes(b"PIEH" + struct.pack("<ii", *size) + bytes(64))
+    assert (file, "cannot be read as optical flow of the frame's size") in audit_dataset(dataset).violations
 
 
 STRAY = (

@@ -195,7 +195,7 @@ class DataYamlCheck(DatasetCheck):
         except FileNotFoundError:
             yield "is missing"
             return
-        except (OSError, ValueError, YAMLError) as error:
+        except (OSError, ValueError, RecursionError, YAMLError) as error:
             yield f"cannot be read ({' '.join(str(error).split())})"
             return
         if not isinstance(data, dict):

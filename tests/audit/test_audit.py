@@ -437,6 +437,12 @@ def test_flow_of_another_size_is_a_violation(dataset: Path, size: tuple[int, int
     assert (file, "cannot be read as optical flow of the frame's size") in audit_dataset(dataset).violations
 
 
+def test_deeply_nested_yaml_is_a_violation(dataset: Path) -> None:
+    (dataset / "data.yaml").write_text("a: " + "[" * 20_000)
+    ((file, text),) = audit_dataset(dataset).violations
+    assert file == "data.yaml" and text.startswith("cannot be read")
+
+
 STRAY = (
     *("annotations/instances_test.json", "bop/models/obj_000009.ply", "bop/train/000000/mask/000000_000009.png"),
     *(

@@ -18,14 +18,15 @@ class LayoutCheck(DatasetCheck):
 
     def __init__(self, root: Path, content: JsonObject) -> None:
         self._root, self._belt = root, BeltMotion(content)
-        self._index, self._instances = -1, dict[int, JsonObject]()
+        self._index = -1
+        self._instances: dict[int, JsonObject] | None = None
 
     def check(self, frame: DecodedFrame) -> Violations:
         """Check that labelled instances match the layout, and that every object of the layout is accounted for."""
         index = frame.record["layout"]
         file = f"layouts/{index:04d}.json"
         if index != self._index:
-            self._index, self._instances = index, {}
+            self._index, self._instances = index, None
             try:
                 layout = read_json(self._root / file)
                 self._instances = {entry["id"]: entry for entry in layout["instances"]}
@@ -35,7 +36,7 @@ class LayoutCheck(DatasetCheck):
                 yield file, "is missing"
             except (OSError, ValueError, KeyError, TypeError) as error:
                 yield file, f"cannot be read ({type(error).__name__}: {error})"
-        if not self._instances:
+        if self._instances is None:
             return
         line = f"manifest.jsonl, frame {frame.index}"
         for label in frame.instances:

@@ -443,6 +443,13 @@ def test_deeply_nested_yaml_is_a_violation(dataset: Path) -> None:
     assert file == "data.yaml" and text.startswith("cannot be read")
 
 
+def test_a_layout_without_objects_is_a_violation_if_there_are_labels(dataset: Path) -> None:
+    path = dataset / "layouts/0000.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"instances": []}))
+    texts = [text for _, text in audit_dataset(dataset).violations]
+    assert any(text.endswith("is not in layouts/0000.json") for text in texts), texts
+
+
 STRAY = (
     *("annotations/instances_test.json", "bop/models/obj_000009.ply", "bop/train/000000/mask/000000_000009.png"),
     *(

@@ -143,7 +143,7 @@ def _held_out(scene: JsonObject) -> set[int]:
     for entry in scene.get("objects", ()) if names else ():
         pool = [f"primitives {n}" for n in range(15)] if entry.get("pool") == "primitives" else entry.get("pool")
         sizes = 5 if isinstance(entry["scale"], list) and entry["scale"][0] < entry["scale"][1] else 1
-        for name in pool or [entry["asset"]]:
+        for name in pool or [entry.get("asset")]:
             found.update(range(position, position + sizes) if name in names else ())
             position += sizes
     return found

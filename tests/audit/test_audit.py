@@ -450,6 +450,25 @@ def test_a_layout_without_objects_is_a_violation_if_there_are_labels(dataset: Pa
     assert any(text.endswith("is not in layouts/0000.json") for text in texts), texts
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("hold_out", 5), ("hold_out", {"assets": 5}), ("objects", 5), ("objects", [{"asset": "nut"}])),
+        *(("conveyor", []), ("conveyor", {"belt": "belt", "speed": 0.1, "interval": "x"})),
+        *(("conveyor", {"belt": "no shape", "speed": 0.1, "interval": 1.0}), ("shapes", None)),
+    ],
+    ids=str,
+)
+def test_a_dataset_of_a_damaged_scene_is_refused(dataset: Path, key: str, value: object) -> None:
+    content = json.loads((dataset / "dataset.json").read_text())
+    content["scene"][key] = value
+    (dataset / "dataset.json").write_text(json.dumps(content))
+    with pytest.raises(
+        InputError, match=rf"must be a dataset of this version of mitsplat \(dataset\.json: scene\.{key}"
+    ):
+        audit_dataset(dataset)
+
+
 STRAY = (
     *("annotations/instances_test.json", "bop/models/obj_000009.ply", "bop/train/000000/mask/000000_000009.png"),
     *(

@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 import numpy as np
 import numpy.typing as npt
 from pycocotools import mask as coco_mask
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from mitsplat.arrays import evenly_spaced
 from mitsplat.dataset.records.manifest import LONGEST_LINE, parse_line, read_lines
@@ -45,12 +45,52 @@ class _Stored(BaseModel):
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
 
+class _Box(_Stored):
+    size: Point
+    position: Point
+    rotate: Point
+
+
+class _Shape(_Stored):
+    name: str
+    box: _Box | None = None
+
+
+class _Entry(_Stored):
+    asset: str | None = None
+    pool: list[str] | str | None = None
+    scale: float | tuple[float, float]
+
+
+class _HoldOut(_Stored):
+    assets: list[str] = []
+
+
+class _Belt(_Stored):
+    belt: str
+    speed: float
+    interval: float
+
+
 class _Scene(_Stored):
     name: str
     seed: Count
     camera: CameraSpec
     labels: LabelRules
     output: Output
+    objects: list[_Entry] = []
+    hold_out: _HoldOut = _HoldOut()
+    shapes: list[_Shape] = []
+    conveyor: _Belt | None = None
+
+    @field_validator("conveyor")
+    @classmethod
+    def _check_belt(cls, conveyor: _Belt | None, checked: ValidationInfo) -> _Belt | None:
+        if conveyor is not None and not any(
+            shape.name == conveyor.belt and shape.box is not None for shape in checked.data.get("shapes", ())
+        ):
+            raise ValueError(f"belt must be a box among the shapes (got {conveyor.belt})")
+        return conveyor
 
 
 class _Content(_Stored):

@@ -30,7 +30,7 @@ from mitsplat.progress import discard_note
 from mitsplat.runtime.device import Device, current_device, use_device
 from mitsplat.scene.planning.frame_plan import layout_index_of, to_index
 from mitsplat.scene.scene import Scene
-from mitsplat.storage.files import Record, open_regular, read_json, storage_errors, write_text
+from mitsplat.storage.files import Record, is_inside, open_regular, read_json, storage_errors, write_text
 
 FRAME = "frame.json"
 
@@ -121,7 +121,7 @@ def _remove_frame(out: Path) -> None:
     except (OSError, ValueError, KeyError, TypeError):
         return
     for name in [*names, *(str(path.relative_to(out)) for path in (out / "layouts").glob("[0-9]*.json"))]:
-        if is_written(name):
+        if is_written(name) and is_inside(out, name):
             (out / name).unlink(missing_ok=True)
 
 

@@ -74,6 +74,16 @@ def test_a_folder_with_other_files_is_refused(scene: Scene, made: Path) -> None:
         rerender_frame(scene, 4, made, **DRAWN)
 
 
+def test_files_outside_of_the_folder_of_a_frame_are_not_removed(scene: Scene, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    again.mkdir()
+    other = tmp_path / ".splats.ply.1.part"
+    other.touch()
+    (again / "frame.json").write_text(json.dumps({"files": {f"../{other.name}": "", str(other): ""}}))
+    rerender_frame(scene, 1, again, **DRAWN)
+    assert other.exists()
+
+
 def test_remaking_a_frame_does_not_change_the_dataset(scene: Scene, made: Path, tmp_path: Path) -> None:
     """Another process may be writing the dataset, so its last line may be incomplete."""
     with (made / "manifest.jsonl").open("ab") as file:

@@ -89,30 +89,30 @@ class FrameJob:
         return json.dumps(layout.to_json())
 
     def _layout(self, index: int, note: Note) -> Layout:
-        """Return the layout from its file.
-
-        If the file is missing, one process settles the layout, and other processes that need it wait.
-        """
+        """Return the layout from its file, which is made if it is missing."""
         if self._cached_layout is not None and self._cached_layout.index == index:
             return self._cached_layout
         path = self.out / layout_file(index)
-        with storage_errors(self.out), open_in_place(path.parent / LOCK, "ab") as lock:
-            fcntl.lockf(lock, fcntl.LOCK_EX, 1, index)  # one byte per layout; released with the file or the process
-            if not path.exists():
-                write_text(path, self.settle_to_json(index, note))
+        with storage_errors(self.out):
+            self._settle_to_file(index, path, note)
             with layout_errors(path), open_regular(path) as file:
                 return self.load_layout(file.read())
+
+    def _settle_to_file(self, index: int, path: Path, note: Note, flags: int = 0) -> None:
+        """Settle the layout if its file is missing; other processes that need the layout wait."""
+        with open_in_place(path.parent / LOCK, "ab") as lock:
+            # One byte is locked for each layout, until the file is closed or the process ends.
+            fcntl.lockf(lock, fcntl.LOCK_EX | flags, 1, index)
+            if not path.exists():
+                write_text(path, self.settle_to_json(index, note))
 
     def settle_ahead(self, layouts: Sequence[int]) -> None:
         """Settle the layouts that have no file, except those that another process settles at that moment."""
         for index in layouts:
             path = self.out / layout_file(index)
-            if path.exists():
-                continue
-            with suppress(BlockingIOError), open_in_place(path.parent / LOCK, "ab") as lock:
-                fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, index)
-                if not path.exists():
-                    write_text(path, self.settle_to_json(index, discard_note))
+            if not path.exists():
+                with suppress(BlockingIOError):
+                    self._settle_to_file(index, path, discard_note, fcntl.LOCK_NB)
 
     def load_layout(self, text: str | bytes) -> Layout:
         """Parse a layout from JSON and cache it; return the cached object if the index is the same.

@@ -81,12 +81,8 @@ def _render_trial_on(device: str, environment: Mapping[str, str]) -> tuple[str, 
 def _processor() -> Finding:
     """Check that the processor has AVX2: kernels are compiled for its features, and are slow without 8 float lanes."""
     machine, cores = platform.machine(), os.cpu_count()
-    flags: set[str] = set()
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith(("flags", "Features")):
-                flags = set(line.partition(":")[2].split())
-                break
+    found = re.search(r"^(?:flags|Features)\s*:(.*)", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    flags = found[1].split() if found else []
     present = [name for name in ("sse4_2", "avx", "avx2", "fma", "avx512f", "asimd", "sve") if name in flags]
     text = f"{machine}, {cores} cores, {' '.join(present) or 'features unknown'}"
     remedy = "use a processor with AVX2: without it rendering takes several times as long"

@@ -58,11 +58,7 @@ class Histogram:
 
 def columns(caption: str, counts: Sequence[int] | npt.NDArray[np.integer], names: Sequence[str], axis: str = "") -> str:
     """Draw a histogram from given counts, with a name for every bin."""
-    ends = (
-        {0.0: names[0], 0.5: names[len(names) // 2], 1.0: names[-1]}
-        if len(names) > 2
-        else dict.fromkeys((0.0,), names[0])
-    )
+    ends = {0.0: names[0]} | ({0.5: names[len(names) // 2], 1.0: names[-1]} if len(names) > 2 else {})
     return _columns(caption, np.asarray(counts), names, ends, axis)
 
 

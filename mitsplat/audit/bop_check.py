@@ -67,10 +67,10 @@ class BopCheck(DatasetCheck):
         if frame.bop_folder != self._folder:
             yield from self._finish_scene()
             self._folder = frame.bop_folder
-            self._cursors = {
-                part: EntryCursor(file := f"{self._folder}/scene_{part}.json", _read_scene(self._root / file))
-                for part in _PARTS
-            }
+            for part in _PARTS:
+                file = f"{self._folder}/scene_{part}.json"
+                entries = ((int(key), value) for key, value in read_entries(self._root / file))
+                self._cursors[part] = EntryCursor(file, entries)
         cameras = yield from self._cursors["camera"].entry_of(frame)
         for camera in cameras:
             yield from prefixed(self._cursors["camera"].file, f"frame {frame.index}", _check_camera(frame, camera))
@@ -176,11 +176,6 @@ class BopCheck(DatasetCheck):
                 for key, value in measured.items()
             ):
                 yield file, f"does not state the measures of {model}"
-
-
-def _read_scene(path: Path) -> Iterator[tuple[int, object]]:
-    for key, value in read_entries(path):
-        yield int(key), value
 
 
 def _check_camera(frame: DecodedFrame, entry: object) -> Iterator[str]:

@@ -147,39 +147,31 @@ def find_device(device: str | Device) -> Device:
     """
     if isinstance(device, Device):
         return device
-    text = check_device_name(device)
-    if text == "cpu":
+    if not isinstance(device, str) or not _DEVICE.fullmatch(device):
+        raise InputError(f"device must be cpu, cuda, cuda:N, cuda:all or auto (got {device})")
+    if device == "cpu":
         return CPU
     gpus = visible_gpus()
     if isinstance(gpus, MissingPrerequisite):
-        if text == "auto":
+        if device == "auto":
             return Device("cpu", reason=gpus.what)
-        raise MissingResourceError(f"{text} cannot be used, because {gpus.what}: {gpus.remedy}, or use the device cpu")
+        raise MissingResourceError(
+            f"{device} cannot be used, because {gpus.what}: {gpus.remedy}, or use the device cpu"
+        )
     first = tuple(gpu for gpu in gpus if gpu.ordinal == 0)
-    if text == "auto":
+    if device == "auto":
         return Device("cuda", first, "NVIDIA's driver and OptiX are complete")
-    if text == "cuda":
+    if device == "cuda":
         return Device("cuda", first)
-    which = text.partition(":")[2]
+    which = device.partition(":")[2]
     if which == "all":
         return Device("cuda", gpus)
     if which == os.environ.get(GPU_NUMBER):
         return Device("cuda", first)
     if int(which) >= len(gpus):
         numbers = f"cuda:0 to cuda:{len(gpus) - 1}" if len(gpus) > 1 else "cuda:0"
-        raise InputError(f"device must be one of the visible GPUs, {numbers} (got {text})")
+        raise InputError(f"device must be one of the visible GPUs, {numbers} (got {device})")
     return Device("cuda", (gpus[int(which)],))
-
-
-def check_device_name(device: str) -> str:
-    """Validate and return the name of a device, which need not exist on this machine.
-
-    Raises:
-        InputError: If the name is invalid.
-    """
-    if not isinstance(device, str) or not _DEVICE.fullmatch(device):
-        raise InputError(f"device must be cpu, cuda, cuda:N, cuda:all or auto (got {device})")
-    return device
 
 
 def gpu_environment(gpu: Gpu | None) -> dict[str, str]:

@@ -16,23 +16,16 @@ MIN_LLVM = 16
 
 
 def use_bundled_llvm() -> None:
-    """Set Dr.Jit's libLLVM to that of this Python environment, unless the user has set one.
+    """Set Dr.Jit's libLLVM to that of a wheel in this Python environment, unless the user has set one.
 
     Dr.Jit must not have been imported.
     """
-    if not os.environ.get(VARIABLE):
-        path = find_bundled_llvm()
-        if path is not None:
-            os.environ[VARIABLE] = str(path)
-
-
-def find_bundled_llvm() -> Path | None:
-    """Return the path of libLLVM that a wheel installed in this environment's ``lib`` folder, or None."""
+    if os.environ.get(VARIABLE):
+        return
     folders = {Path(sysconfig.get_path("data")) / "lib", Path(sysconfig.get_path("platlib")).parents[1]}
-    for folder in sorted(folders):
-        if (folder / "libLLVM.so").exists():
-            return folder / "libLLVM.so"
-    return None
+    library = next((path for folder in sorted(folders) if (path := folder / "libLLVM.so").exists()), None)
+    if library is not None:
+        os.environ[VARIABLE] = str(library)
 
 
 def check_llvm() -> None:

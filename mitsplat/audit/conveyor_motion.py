@@ -22,16 +22,17 @@ class BeltMotion:
 
     def __init__(self, content: JsonObject) -> None:
         scene = content["scene"]
-        self._conveyor = None if content.get("given", False) else scene.get("conveyor")
-        if self._conveyor is None:
-            return
-        self._box = next(shape["box"] for shape in scene["shapes"] if shape["name"] == self._conveyor["belt"])
-        self._turn = Rotation.from_euler("xyz", self._box["rotate"], degrees=True)
-        self._last_view = scene["output"]["views"] - 1
+        conveyor = None if content.get("given", False) else scene.get("conveyor")
+        self._box: JsonObject | None = None
+        self._step, self._last_view = np.zeros(3), scene["output"]["views"] - 1
+        if conveyor is not None:
+            self._box = next(shape["box"] for shape in scene["shapes"] if shape["name"] == conveyor["belt"])
+            self._turn = Rotation.from_euler("xyz", self._box["rotate"], degrees=True)
+            self._step = conveyor["interval"] * conveyor["speed"] * self._turn.apply((1.0, 0.0, 0.0))
 
     def carries(self, pose: Float64Array) -> bool:
         """Return True if the belt carries an object at a pose (4, 4), because the object's origin is above the belt."""
-        if self._conveyor is None:
+        if self._box is None:
             return False
         position, half = self._turn.inv().apply(pose[:3, 3] - self._box["position"]), np.array(self._box["size"]) / 2
         return bool((abs(position[:2]) <= half[:2]).all() and position[2] > half[2] - _MAX_DEPTH)
@@ -42,9 +43,8 @@ class BeltMotion:
 
     def between(self, frame: DecodedFrame, following: DecodedFrame) -> Float64Array:
         """Return the displacement of the belt between two frames of the same layout [m], shape (3,)."""
-        return np.zeros(3) if self._conveyor is None else self._travel(following) - self._travel(frame)
+        return self._travel(following) - self._travel(frame)
 
     def _travel(self, frame: DecodedFrame) -> Float64Array:
-        assert self._conveyor is not None  # noqa: S101
-        time = self._conveyor["interval"] * (frame.record["view"] - self._last_view / 2)
-        return np.asarray(time * self._conveyor["speed"] * self._turn.apply((1.0, 0.0, 0.0)))
+        """Return the displacement of the belt since the middle of the layout's views [m], shape (3,)."""
+        return np.asarray((frame.record["view"] - self._last_view / 2) * self._step)

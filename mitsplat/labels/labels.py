@@ -346,11 +346,8 @@ def _amodal(
     full = Silhouette.cropped(without_fragments(joint, min_fragment)[0], x0, y0)
     if min(full.box[:2]) >= 0 and full.box[2] <= size[0] and full.box[3] <= size[1]:
         return full, full.box, full.area
-    inside = full.clipped(*size)
-    cleaned = None if inside is None else without_fragments(inside.mask, min_fragment)[0]
-    if inside is None or cleaned is None or not cleaned.any():
-        raise AssertionError("the visible mask of an instance must be part of its silhouette")
-    return Silhouette.cropped(cleaned, *inside.box[:2]), full.box, full.area
+    inside = cast(Silhouette, full.clipped(*size))  # not empty, as it contains the visible mask
+    return Silhouette.cropped(without_fragments(inside.mask, min_fragment)[0], *inside.box[:2]), full.box, full.area
 
 
 def _agreement(

@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsplat.asset import Asset
 from mitsplat.frames.scene_builder import SceneBuilder
 from mitsplat.renderer.materials.proxy_materials import MaterialColumns, part_materials
 from mitsplat.renderer.occluders.proxies import Occluder, world_corners
@@ -19,11 +18,8 @@ from mitsplat.scene.scene import Scene
 
 def without_materials(scene: Scene) -> Scene:
     """Return a scene whose objects show their base colours as captured colours."""
-
-    def captured(asset: Asset) -> Asset:
-        return replace(asset, splats=replace(asset.splats, materials=None))
-
-    return replace(scene, assets=tuple(map(captured, scene.assets)))
+    captured = [replace(asset, splats=replace(asset.splats, materials=None)) for asset in scene.assets]
+    return replace(scene, assets=tuple(captured))
 
 
 class MeshSceneBuilder(SceneBuilder):

@@ -400,6 +400,12 @@ def test_run_lengths_agree_with_pycocotools() -> None:
         assert again["counts"] == code["counts"]
 
 
+def test_a_run_length_without_end_is_refused() -> None:
+    """The time to read it would grow with the square of its characters."""
+    with pytest.raises(ValueError, match="a run length has too many characters"):
+        _run_lengths("o" * 100 + "0")
+
+
 def test_linked_folders_are_followed_once(tmp_path: Path) -> None:
     root, other = write_yolo(tmp_path / "root", {"train": 2}), write_yolo(tmp_path / "other", {"train": 3})
     for kind in ("images", "labels"):

@@ -16,6 +16,8 @@ from mitsplat.storage.files import JsonObject
 
 _BOX_TOLERANCE = 2.0
 """Largest difference of a box from the bounds of its segmentation at which both are the same [px]."""
+_MAX_RUN_BITS = 64
+"""Largest number of bits of a run length; longer ones would take a time with the square of their length to read."""
 _MAX_BEYOND = 0.25
 """Largest distance by which a segmentation leaves its box, as a share of the sides of the box."""
 
@@ -147,6 +149,8 @@ def _run_lengths(code: str) -> list[int]:
         bits = ord(letter) - 48
         value |= (bits & 31) << shift
         shift += 5
+        if shift > _MAX_RUN_BITS:
+            raise ValueError("a run length has too many characters")
         if not bits & 32:
             value -= (bits & 16) << (shift - 4)
             lengths.append(value + (lengths[-2] if len(lengths) > 2 else 0))

@@ -196,10 +196,10 @@ class PanopticCheck(DatasetCheck):
         if ids is None:
             return  # reported by the check of that file
         stated = entry.get("segments_info")
-        if not are_objects(stated):
-            yield "segments_info must be a list of segments"
+        if not are_objects(stated) or not all(isinstance(segment.get("id"), int) for segment in stated):
+            yield "segments_info must be a list of segments with whole numbers as ids"
             return
-        segments = {segment.get("id"): segment for segment in stated}
+        segments = {segment["id"]: segment for segment in stated}
         present = {int(number) for number in np.unique(ids)} - {0}
         if set(segments) != present or len(segments) != len(stated):
             yield f"its segments are {sorted(segments, key=str)}, those of its picture {sorted(present)}"

@@ -409,6 +409,11 @@ def test_a_changed_or_missing_file_is_a_violation(dataset: Path, file: str) -> N
         ("annotations/instances_train.json", lambda c: c["annotations"][0].update(category_id=9), "category_id"),
         ("annotations/amodal_train.json", lambda c: c["annotations"].pop(), "annotations"),
         ("annotations/panoptic_train.json", lambda c: c["categories"][0].update(name="x"), "categories[0]: name"),
+        (
+            "annotations/panoptic_train.json",
+            lambda c: c["annotations"][0]["segments_info"][0].update(id=[1]),
+            "segments_info must be a list of segments",
+        ),
         ("bop/train/000000/scene_gt.json", lambda c: c["0"][0]["cam_t_m2c"].__setitem__(2, 5.0), "cam_t_m2c is"),
         ("bop/train/000000/scene_gt_info.json", lambda c: c["0"][0].update(visib_fract=0.1), "visib_fract"),
     ],

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
@@ -276,13 +277,19 @@ class PosesCheck(DatasetCheck):
 def _decode_polygons(frame: DecodedFrame, polygons: object) -> object:
     """Return the run-length code of a union of polygons, as pycocotools fills them; None if they are invalid."""
     width, height = frame.size
-    if not isinstance(polygons, list) or not polygons or not all(isinstance(one, list) for one in polygons):
+    if not isinstance(polygons, list) or not polygons or not all(_is_polygon(one, frame.size) for one in polygons):
         return None
-    try:
-        code = coco_mask.merge(coco_mask.frPyObjects(polygons, height, width))
-    except Exception:  # noqa: BLE001 - pycocotools raises various types
-        return None
+    code = coco_mask.merge(coco_mask.frPyObjects(polygons, height, width))
     return {"size": code["size"], "counts": code["counts"].decode("ascii")}
+
+
+def _is_polygon(points: object, size: tuple[int, int]) -> bool:
+    """Return True for a list of at least three points in the image; pycocotools may crash on other numbers."""
+    if not isinstance(points, list) or not all(isinstance(value, int | float) for value in points):
+        return False
+    if len(points) < 6 or len(points) % 2:
+        return False
+    return all(0 <= value <= side for value, side in zip(points, itertools.cycle(size), strict=False))
 
 
 def _check_segmentation(frame: DecodedFrame, label: DecodedInstance, code: object, *, amodal: bool) -> Iterator[str]:

@@ -434,6 +434,17 @@ def test_permuted_class_names_are_violations(dataset: Path) -> None:
     assert [file for file, _ in audit_dataset(dataset).violations] == ["data.yaml"]
 
 
+@pytest.mark.parametrize("value", [None, 1e308, -1e9, "x", 10**400], ids=lambda value: str(value)[:9])
+def test_polygons_outside_of_the_image_are_violations(dataset: Path, value: object) -> None:
+    """pycocotools crashes on such numbers, or allocates memory for them."""
+    path = dataset / "annotations/polygons_train.json"
+    content = json.loads(path.read_text())
+    content["annotations"][0]["segmentation"][0][2] = value
+    path.write_text(json.dumps(content))
+    texts = [text for _, text in audit_dataset(dataset).violations]
+    assert any(text.endswith("segmentation is no mask that pycocotools reads") for text in texts), texts
+
+
 @pytest.mark.parametrize("size", [(-1, -1), (2**31 - 1, 2**31 - 1), (4, 4)])
 def test_flow_of_another_size_is_a_violation(dataset: Path, size: tuple[int, int]) -> None:
     """OpenCV crashes on negative sizes, and allocates memory for the size in the header."""

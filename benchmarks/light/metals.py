@@ -59,6 +59,10 @@ SPACING = 0.065
 """Distance between the centres of objects [m]."""
 GAUSSIANS = 6000
 """Gaussians of each object."""
+POSITIONS = 9
+"""Positions of paths along a pixel's side. Highlights on bevels are a third of a pixel wide: the mean colours of boxes
+of roughness 0.1 differ by up to 5 % from those with 3 positions.
+"""
 LAMPS = (
     AreaLight(position=(0.45, 0.0, 0.55), target=(0, 0, 0), size=(0.15, 0.15), radiance=45.0, colour=(1.0, 0.45, 0.12)),
     AreaLight(position=(-0.45, 0.1, 0.55), target=(0, 0, 0), size=(0.15, 0.15), radiance=45.0, colour=(0.15, 0.4, 1.0)),
@@ -147,7 +151,8 @@ def render_pair(
     A smaller ``width`` has more paths per pixel: the reference has the same number in all.
     """
     camera = Camera.look_at((0, -0.36, 0.36), (0, -0.01, 0.01), width=width, height=width * 3 // 4, fov_x=46.0)
-    shots = Photographer(camera, options.out / "metals", options.samples * (400 // width) ** 2)
+    more = 400 // width
+    shots = Photographer(camera, options.out / "metals", options.samples * more**2, POSITIONS * more)
     parts, emitters = [solid.placed() for solid in solids.values()], bake_lights(lights)
     path, _ = shots.take(name, [mat, *parts], emitters)
     thing, cover = coverage(camera, [mat], [[part] for part in parts])

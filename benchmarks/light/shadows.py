@@ -63,11 +63,11 @@ from mitsplat.scene.spec.image_spec import Composite
 class Photographer:
     """Path-traced linear images, cached in a folder.
 
-    The number of paths per pixel is rounded to that of a square grid in each part of a pixel.
+    A pixel has ``side`` x ``side`` positions, and the number of paths is rounded to that of a square grid at each.
     """
 
-    def __init__(self, camera: Camera, folder: Path, samples: int) -> None:
-        self.camera, self.folder, self.samples = camera, folder, samples
+    def __init__(self, camera: Camera, folder: Path, samples: int, side: int = 3) -> None:
+        self.camera, self.folder, self.samples, self.side = camera, folder, samples, side
         folder.mkdir(parents=True, exist_ok=True)
 
     def take(
@@ -80,7 +80,7 @@ class Photographer:
         clay: bool = False,
     ) -> tuple[Float64Array, Float64Array]:
         """Return radiance (H, W, 3) averaged over each pixel, and coverage (H, W)."""
-        side, camera = 3, self.camera
+        side, camera = self.side, self.camera
         samples = max(1, round(self.samples**0.5 / side)) ** 2
         file = self.folder / f"{name}_{side * side * samples}.npz"
         if not file.exists():

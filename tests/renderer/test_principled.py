@@ -15,8 +15,17 @@ from mitsplat.renderer.materials.principled import SpecularLobe, diffuse_reflect
 
 COUNT = 4096
 BASE = (0.8, 0.4, 0.2)
-CASES = [(0.3, 1.0, 0.5), (0.5, 0.0, 0.5), (0.2, 0.4, 0.8), (0.1, 1.0, 0.5), (1.0, 0.7, 1.0)]
-"""Roughness, metallic and specular."""
+Case = tuple[float, float, float, float]
+CASES: list[Case] = [
+    (0.3, 1.0, 0.5, 0.0),
+    (0.5, 0.0, 0.5, 0.0),
+    (0.2, 0.4, 0.8, 0.0),
+    (0.1, 1.0, 0.5, 0.0),
+    (1.0, 0.7, 1.0, 0.0),
+    (0.3, 1.0, 0.5, 0.6),
+    (0.5, 0.2, 0.5, 1.0),
+]
+"""Roughness, metallic, specular and ``anisotropic`` of the BSDF ``principled``."""
 
 
 def directions(seed: int) -> mi.Vector3f:
@@ -27,11 +36,17 @@ def directions(seed: int) -> mi.Vector3f:
     return mi.Vector3f(np.stack([side * np.cos(angle), side * np.sin(angle), z]).astype(np.float32))
 
 
-def lobe(view: mi.Vector3f, roughness: float, metallic: float, specular: float) -> SpecularLobe:
-    return SpecularLobe.of(mi.Vector3f(0, 0, 1), view, mi.Float(roughness), mi.Float(metallic), mi.Float(specular))
+def lobe(
+    view: mi.Vector3f, roughness: float, metallic: float, specular: float, anisotropic: float = 0.0
+) -> SpecularLobe:
+    """``principled`` has the GGX parameters roughness^2 / aspect and roughness^2 aspect."""
+    aspect = np.sqrt(1 - 0.9 * anisotropic)
+    spread = roughness**2 * np.sqrt(1 / aspect**2 - aspect**2)
+    parameters = mi.Float(float(roughness * np.sqrt(aspect))), mi.Float(metallic), mi.Float(specular)
+    return SpecularLobe.of(mi.Vector3f(0, 0, 1), view, *parameters, mi.Vector3f(float(spread), 0, 0))
 
 
-def reflected(view: mi.Vector3f, light: mi.Vector3f, case: tuple[float, float, float]) -> npt.NDArray[np.float64]:
+def reflected(view: mi.Vector3f, light: mi.Vector3f, case: Case) -> npt.NDArray[np.float64]:
     """Return f cos of the specular lobe for the base colour, shape (3, COUNT)."""
     own = lobe(view, *case)
     value, _, cos_half = own.evaluate(light)
@@ -40,11 +55,11 @@ def reflected(view: mi.Vector3f, light: mi.Vector3f, case: tuple[float, float, f
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_lobe_and_diffuse_share_equal_those_of_mitsuba(case: tuple[float, float, float]) -> None:
+def test_lobe_and_diffuse_share_equal_those_of_mitsuba(case: Case) -> None:
     """The diffuse part is that of Burley 2012, for the base colour (1 - metallic)."""
-    roughness, metallic, specular = case
+    roughness, metallic, specular, anisotropic = case
     description = {"type": "principled", "base_color": {"type": "rgb", "value": list(BASE)}, "roughness": roughness}
-    bsdf = mi.load_dict({**description, "metallic": metallic, "specular": specular})
+    bsdf = mi.load_dict({**description, "metallic": metallic, "specular": specular, "anisotropic": anisotropic})
     view, light = directions(0), directions(1)
     si = mi.SurfaceInteraction3f()
     si.wi = view
@@ -56,7 +71,7 @@ def test_lobe_and_diffuse_share_equal_those_of_mitsuba(case: tuple[float, float,
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_light_and_camera_can_be_exchanged(case: tuple[float, float, float]) -> None:
+def test_light_and_camera_can_be_exchanged(case: Case) -> None:
     """Helmholtz reciprocity: f(v, w) = f(w, v)."""
     view, light = directions(2), directions(3)
     there = reflected(view, light, case) / np.array(light.z)
@@ -65,7 +80,7 @@ def test_light_and_camera_can_be_exchanged(case: tuple[float, float, float]) -> 
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_samples_have_the_stated_density_and_weight(case: tuple[float, float, float]) -> None:
+def test_samples_have_the_stated_density_and_weight(case: Case) -> None:
     own = lobe(directions(4), *case)
     rng = np.random.default_rng(5)
     direction, weight, cos_half = own.sample(mi.Point2f(rng.random((2, COUNT)).astype(np.float32)))

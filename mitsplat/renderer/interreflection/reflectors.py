@@ -268,7 +268,7 @@ class Reflectors:
             direction, fresnel = dr.select(point.metal, mirrored, direction), lobe.fresnel(cos_half)
             throughput = dr.select(point.metal, (surface.colour * fresnel.tint + fresnel.white) * weight, throughput)
             density = dr.select(point.metal, lobe.evaluate(direction)[1], 0)
-            spread = dr.select(point.metal, lobe.alpha, spread)
+            spread = dr.select(point.metal, lobe.blur, spread)
         onward, normal = mi.Ray3f(point.origin, direction), point.normal
         throughput = dr.select(dr.dot(normal, direction) > 0, throughput, 0)
         dr.eval(lit, onward, throughput, normal, density, other, spread)
@@ -301,7 +301,7 @@ class Reflectors:
         fresnel = lobe.fresnel(cos_half)
         reflectance = (surface.colour * fresnel.tint + fresnel.white) * (dr.pi * value / dr.maximum(cosine, 1e-3))
         weight = dr.select(metal, power_weight(beam.density, density), 1)
-        used = (cosine > 0) & (metal | (lobe.alpha >= MIN_LAMP_ROUGHNESS**2))
+        used = (cosine > 0) & (metal | (lobe.blur >= MIN_LAMP_ROUGHNESS**2))
         return dr.select(used, reflectance * beam.irradiance * (weight / self.white), 0)
 
 

@@ -142,10 +142,10 @@ class ReflectionTracer:
         ray = mi.Ray3f(mi.Point3f(ray_origin(surface)), direction - 2 * below * surface.face)
         si = receiver(surface.position, surface.normal)
         active = (tint > 0) | (white > 0)
-        dr.eval(ray, si, tint, white, density, active, number, lobe.alpha)
+        dr.eval(ray, si, tint, white, density, active, number, lobe.blur)
         # Few neighbours mirror similar directions, so that random numbers leave the least structure.
         key = mi.sample_tea_32(number, mi.UInt32(0), 4)[0]
-        light, ray.maxt = self.reflectors.outgoing(ray, key, sequence_point(number), lobe.alpha)
+        light, ray.maxt = self.reflectors.outgoing(ray, key, sequence_point(number), lobe.blur)
         dr.eval(light, ray)
         radiance, other = self.tracer.emitters.emission(self.reflectors.scene, si, ray, active)
         light += radiance * (power_weight(density, other) * dr.pi / self.reflectors.white)

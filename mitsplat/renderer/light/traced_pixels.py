@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import drjit as dr
@@ -12,7 +12,7 @@ from mitsplat.renderer.light.bounce import Bounce
 from mitsplat.renderer.light.light_estimate import Estimate, LightMeans
 from mitsplat.renderer.light.light_filter import UNTRACED, LightFilter
 from mitsplat.renderer.light.light_planes import CoarseLight
-from mitsplat.renderer.light.light_points import LightPoints, filtered_roughness
+from mitsplat.renderer.light.light_points import LightPoints, bent_pixels, filtered_lobes
 from mitsplat.renderer.light.light_tiles import block_order
 from mitsplat.renderer.light.lighting import Lighting
 from mitsplat.renderer.light.lit_surface import LitSurface
@@ -67,10 +67,11 @@ class TracedPixels:
         here = visible.at(index)
         dr.eval(here)
         light_filter = LightFilter(here, view, index, coarse and coarse.coarse)
-        here = replace(here, roughness=filtered_roughness(here, index, light_filter.place, view))
+        bent = bent_pixels(here, index, light_filter.place, view)
+        here = filtered_lobes(here, index, light_filter.place, view)
         dr.eval(here)
         order = _in_blocks(light_filter.place, view)
-        points = LightPoints.of(visible, here, index, light_filter.place, order)
+        points = LightPoints.of(visible, here, bent, index, order)
         return cls(lighting, index, here, light_filter, points, order, coarse)
 
     @cached_property

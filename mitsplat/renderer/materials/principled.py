@@ -55,26 +55,46 @@ class SpecularLobe:
     Attributes:
         frame: Shading frame.
         view: Unit vector towards the camera in the shading frame.
-        alpha: GGX parameter.
+        alpha: GGX parameters along the axes x and y of the frame.
         metallic: Metalness.
         specular: Reflectance of the dielectric at normal incidence over 0.08.
     """
 
     frame: mi.Frame3f
     view: mi.Vector3f
-    alpha: mi.Float
+    alpha: mi.Vector2f
     metallic: mi.Float
     specular: mi.Float
 
     @classmethod
     def of(
-        cls, normal: mi.Vector3f, to_camera: mi.Vector3f, roughness: mi.Float, metallic: mi.Float, specular: mi.Float
+        cls,
+        normal: mi.Vector3f,
+        to_camera: mi.Vector3f,
+        roughness: mi.Float,
+        metallic: mi.Float,
+        specular: mi.Float,
+        spread: mi.Vector3f | None = None,
     ) -> SpecularLobe:
-        """Return the lobes of points with unit ``normal`` and unit vector ``to_camera``."""
+        """Return the lobes of points with unit ``normal`` and unit vector ``to_camera``.
+
+        ``spread`` is a tangent in whose direction the squared GGX parameter is larger by the squared length.
+        """
         frame = mi.Frame3f(mi.Normal3f(normal))
+        alpha = mi.Vector2f(dr.maximum(dr.square(roughness), MIN_ALPHA))
+        if spread is not None:
+            length2 = dr.squared_norm(spread)
+            along = dr.select(length2 > 0, dr.normalize(spread), frame.s)
+            frame = mi.Frame3f(along, dr.cross(normal, along), normal)
+            alpha.x = dr.sqrt(dr.square(alpha.x) + length2)
         view = frame.to_local(to_camera)
         view.z = dr.maximum(view.z, MIN_COSINE)
-        return cls(frame, dr.normalize(view), dr.maximum(dr.square(roughness), MIN_ALPHA), metallic, specular)
+        return cls(frame, dr.normalize(view), alpha, metallic, specular)
+
+    @property
+    def blur(self) -> mi.Float:
+        """GGX parameter of the isotropic lobe that covers the same solid angle."""
+        return dr.sqrt(self.alpha.x * self.alpha.y)
 
     def evaluate(self, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Return D G / (4 n.v), its sampling density, and v.h for unit vectors towards the light."""
@@ -82,8 +102,8 @@ class SpecularLobe:
         half = dr.normalize(light + self.view)
         cos_half = dr.dot(half, self.view)
         above = (light.z > 0) & (cos_half > 0)
-        scaled = (dr.square(half.x) + dr.square(half.y)) / dr.square(self.alpha) + dr.square(half.z)
-        distribution = 1 / (dr.pi * dr.square(self.alpha) * dr.square(scaled))
+        scaled = dr.square(half.x / self.alpha.x) + dr.square(half.y / self.alpha.y) + dr.square(half.z)
+        distribution = 1 / (dr.pi * self.alpha.x * self.alpha.y * dr.square(scaled))
         density = dr.select(above, distribution * self._unmasked(self.view) / (4 * self.view.z), 0)
         return density * self._unmasked(light), density, cos_half
 
@@ -95,7 +115,7 @@ class SpecularLobe:
         Returns:
             Unit vector towards the light, D G / (4 n.v) over its density, and v.h.
         """
-        stretch = mi.Vector3f(self.alpha, self.alpha, 1)
+        stretch = mi.Vector3f(self.alpha.x, self.alpha.y, 1)
         view = dr.normalize(self.view * stretch)
         z = dr.fma(1 - point.y, 1 + view.z, -view.z)
         radius = dr.safe_sqrt(1 - dr.square(z))
@@ -115,9 +135,9 @@ class SpecularLobe:
 
     def _unmasked(self, direction: mi.Vector3f) -> mi.Float:
         """Return Smith's share of microfacets that ``direction`` (in the frame) reaches."""
-        cosine2 = dr.square(direction.z)
-        tangent2 = dr.maximum(1 - cosine2, 0) / dr.maximum(cosine2, 1e-12)
-        return dr.select(direction.z > 0, 2 / (1 + dr.sqrt(dr.fma(dr.square(self.alpha), tangent2, 1))), 0)
+        slope2 = dr.square(direction.x * self.alpha.x) + dr.square(direction.y * self.alpha.y)
+        slope2 /= dr.maximum(dr.square(direction.z), 1e-12)
+        return dr.select(direction.z > 0, 2 / (1 + dr.sqrt(slope2 + 1)), 0)
 
 
 def typical_brightness(tinted: mi.Color3f, colourless: mi.Color3f) -> mi.Float:

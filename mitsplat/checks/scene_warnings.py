@@ -121,14 +121,15 @@ def _bin_warnings(scene: Scene) -> Iterator[Finding]:
 
 
 def _class_warnings(scene: Scene) -> Iterator[Finding]:
-    """Warn of class names that are probably one class: they differ in case, blanks, or the encoding of accents."""
+    """Warn of class names that are probably one class: they differ in case, separators, or the encoding of accents."""
     spellings: dict[str, list[str]] = {}
     for name in scene.class_names:
         plain = re.sub(r"[\s_-]+", "_", unicodedata.normalize("NFKC", name).casefold()).strip("_")
         spellings.setdefault(plain, []).append(name)
     for names in spellings.values():
         if len(names) > 1:
-            text = f"objects: classes {' and '.join(map(repr, names))} differ only in case, blanks or accents' encoding"
+            spelt = " and ".join(map(repr, names))
+            text = f"objects: classes {spelt} differ only in case, separators or accents' encoding"
             yield fault("classes", text, "if they are one class, write one name: class_name, or class of asset.yaml")
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 
-from mitsplat.arrays import Float64Array, Int64Array
+from mitsplat.arrays import BoolArray, Float64Array, Int64Array
 from mitsplat.bake.file_normals import NormalCount, normal_warnings, place_normals
 from mitsplat.bake.surface_materials import SurfaceFinish
 from mitsplat.errors import InputError
@@ -219,8 +219,11 @@ def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> 
         corners = corners[::-1]
     geometry = trimesh.Trimesh(source.vertices, source.faces, process=False)
     geometry.merge_vertices(merge_tex=True, merge_norm=True)
-    # Only collapsed faces are removed, because removing slivers would open holes.
+    # Only collapsed and repeated faces are removed, because removing slivers would open holes.
     keep = np.diff(np.sort(geometry.faces, axis=1), axis=1).all(axis=1)
+    first = _first_copies(geometry.faces)
+    repeated = int(np.count_nonzero(keep & ~first))
+    keep &= first
     vertices = trimesh.transform_points(geometry.vertices, transform)
     mesh = trimesh.Trimesh(vertices, geometry.faces[keep][:, corners], process=False)
     mesh.remove_unreferenced_vertices()
@@ -234,6 +237,10 @@ def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> 
     material = finish.applied_to(source.material)
     name, texture, colours = source.name, select(material.texture), None
     warnings = [f"material of part {name!r}: {warning}" for warning in material.warnings]
+    if repeated:
+        warnings.append(
+            f"{repeated} faces of part {name!r} repeat other faces of it and are left out: was it exported twice?"
+        )
     if material.specular > MAX_SPECULAR:
         warnings.append(f"part {name!r} reflects {material.specular:.2g} at normal incidence: {MAX_SPECULAR} is used")
     painted = source.colours if finish.colour is None else None
@@ -259,6 +266,15 @@ def _place(source: FilePart, transform: Float64Array, finish: SurfaceFinish) -> 
         double_sided=source.double_sided and not (mesh.is_watertight and mesh.volume > 0),
     )
     return part, count
+
+
+def _first_copies(faces: Int64Array) -> BoolArray:
+    """Return a mask (F,) without the faces that repeat the vertices and the winding of an earlier face."""
+    starts = faces.argmin(axis=1)[:, None]
+    turned = np.take_along_axis(faces, (starts + np.arange(3)) % 3, axis=1)
+    is_first = np.zeros(len(faces), dtype=bool)
+    is_first[np.unique(turned, axis=0, return_index=True)[1]] = True
+    return is_first
 
 
 def _recentre(parts: Sequence[MeshPart], file: MeshFile, source: str) -> Iterator[str]:

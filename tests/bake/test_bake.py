@@ -158,6 +158,25 @@ def test_thin_sheet_keeps_surfels_on_both_sides() -> None:
     assert (up < -0.9).sum() > 350
 
 
+def test_repeated_faces_of_a_part_are_left_out_with_one_warning(tmp_path: Path) -> None:
+    """A part that was exported twice: the second copy begins its faces at other corners."""
+    box = trimesh.creation.box(extents=(0.05, 0.04, 0.03))
+    faces = np.concatenate([box.faces, np.roll(box.faces, 1, axis=1)])
+    trimesh.Trimesh(box.vertices, faces, process=False).export(tmp_path / "twice.stl")
+    box.export(tmp_path / "once.stl")
+    twice, once = (bake_asset(tmp_path / f"{name}.stl", name="box", settings=quick()) for name in ("twice", "once"))
+    assert len(twice.warnings) == 1 and twice.warnings[0].startswith("12 faces of part "), twice.warnings
+    assert np.array_equal(twice.asset.splats.means, once.asset.splats.means)
+    assert twice.asset.mesh.is_volume and not once.warnings
+
+
+def test_both_sides_of_a_sheet_are_kept() -> None:
+    """Faces of opposite winding are no copies."""
+    square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]])
+    (part,) = read_model(square).parts
+    assert len(part.mesh.faces) == 4 and not part.warnings
+
+
 def test_a_solid_inside_another_one_gets_no_gaussians() -> None:
     hidden, outer = trimesh.creation.icosphere(2, 0.005), trimesh.creation.box(extents=(0.03, 0.03, 0.03))
     nested = trimesh.Scene({"hidden": white(hidden), "outer": white(outer)})

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from mitsplat.asset import ASSET_FILE, Asset
-from mitsplat.bake.mesh_parts import read_parts
+from mitsplat.bake.mesh_parts import read_model
 from mitsplat.bake.mesh_surface import MeshSurface
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.spherical_harmonics import SH_C0
@@ -56,7 +56,7 @@ def replace_colours(data: bytes, sh: npt.NDArray[np.floating]) -> bytes:
 
 
 def recolour(name: str, folder: Path) -> None:
-    surface = MeshSurface(read_parts(build_part(name, 0)[0]))
+    surface = MeshSurface(read_model(build_part(name, 0)[0]).parts)
     splats = Asset.load(folder).splats
     colours, materials = surface.sample_surfels(surfels_of(splats, surface.mesh), np.random.default_rng(0))
     stored = (folder / "splats.spz").read_bytes()

@@ -66,6 +66,8 @@ _STAGES = {
     "comparing with the mesh": 8,
 }
 """Stages of a bake, with their relative durations."""
+_MIN_PSNR = 24.0
+"""PSNR on unseen views below which splats differ clearly from the mesh: an RMSE of 10^(-24/20), 6.3 % of the range."""
 _MAX_BACKS = 0.02
 """Maximum share of visible points of an object that are backs of one-sided faces."""
 
@@ -216,6 +218,12 @@ def bake_asset(
         cameras = cameras or _orbit(surface.mesh, settings.verify_views)
         views, psnr, psnr_object = compare_views(pictures, splats, cameras, settings.seed, stages.step)
         result = replace(result, views=views, psnr=psnr, psnr_object=psnr_object)
+        if psnr < _MIN_PSNR:
+            warnings.append(
+                f"the splats have a PSNR of {psnr:.1f} dB on unseen views, below {_MIN_PSNR:g} dB: compare them with "
+                "the mesh in report.html; likely causes are too few Gaussians for its colours and thin features "
+                "(--gaussians), or surfaces that lie in each other"
+            )
     if settings.verify_views and lights is None:
         brightness, different = compare_with_textures(model.parts, splats, surface.parts_of(surfels.faces))
         result = replace(result, brightness=brightness)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import mitsplat
 from mitsplat.asset import Asset
 from mitsplat.bake.bake import BakeSettings, bake_asset
+from mitsplat.bake.bake_report import write_bake_report
 from mitsplat.bake.mesh_parts import read_model
 from mitsplat.bake.part_shapes import UNIFORM_LIGHT, bake_lights, mitsuba_scene
 from mitsplat.errors import InputError
@@ -200,6 +201,17 @@ def test_baked_sphere_has_30_db_from_views_that_were_not_fitted() -> None:
     result = bake_asset(ball, name="ball", settings=quick(gaussians=3000, fit_steps=40, verify_views=2))
     assert result.psnr > 30.0
     assert result.psnr_object > 24.0
+
+
+def test_splats_that_differ_from_the_mesh_are_reported(tmp_path: Path) -> None:
+    """Forty Gaussians are too few for the sides of a coloured box."""
+    box, _ = coloured_box()
+    few, many = (
+        bake_asset(box, name="box", settings=quick(gaussians=n, verify_views=2, fit_steps=40)) for n in (40, 5000)
+    )
+    assert few.psnr < 24 < many.psnr, (few.psnr, many.psnr)
+    assert [f"PSNR of {few.psnr:.1f} dB on unseen views" in text for text in few.warnings] == [True]
+    assert not many.warnings and "Nothing to note" in write_bake_report(tmp_path, many).read_text()
 
 
 def test_texture_is_placed_by_its_coordinates(tmp_path: Path) -> None:

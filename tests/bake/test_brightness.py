@@ -44,7 +44,7 @@ def test_patterns_finer_than_gaussians_keep_their_mean_brightness(pixels: np.nda
     """Specks of white on black are seen from afar by their mean radiance, not by their mean code value."""
     result = bake(textured_box(pixels))
     assert result.brightness == pytest.approx(1.0, abs=0.1)
-    assert result.warnings == ()
+    assert not any("times as bright" in warning for warning in result.warnings)
 
 
 def test_patterns_under_lights_keep_their_mean_radiance() -> None:

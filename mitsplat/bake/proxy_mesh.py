@@ -10,8 +10,9 @@ import shapely
 import trimesh
 
 from mitsplat.bake.mesh_parts import MeshPart
-from mitsplat.geometry.mesh import is_closed, simplify_solid
+from mitsplat.geometry.mesh import is_closed, join_meshes, separate_solids, simplify_solid
 from mitsplat.geometry.mesh_holes import close_holes
+from mitsplat.geometry.mesh_points import points_inside
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 
 _LABEL_GAP = 0.01
@@ -29,7 +30,7 @@ def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
     re-triangulated from their outlines.
     """
     meshes = [_close_solid(part.mesh) for part in parts]
-    solids = [mesh for mesh in meshes if mesh.is_volume]
+    solids = [body for mesh in meshes if mesh.is_volume for body in _bodies(mesh)]
     sheets = [mesh for mesh in meshes if not mesh.is_volume]
     if len(solids) > 1:
         solids = [_unite(solids)]
@@ -39,6 +40,26 @@ def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
     face_budget = max(most_faces - sum(len(sheet.faces) for sheet in sheets), most_faces // 2)
     solids = [_simplify(solid, face_budget) for solid in solids]
     return _merged(trimesh.util.concatenate(solids + sheets))
+
+
+def _bodies(solid: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Return the bodies of a solid, each with the cavities inside it.
+
+    A cavity belongs to the smallest body around it. A solid is returned unchanged if its bodies are apart, or if one of
+    its surfaces is inside out and in no body.
+    """
+    surfaces = sorted(separate_solids(solid), key=lambda surface: float(surface.volume))
+    bodies = {number: [surface] for number, surface in enumerate(surfaces) if surface.volume > 0}
+    low, high = np.moveaxis(np.array([surfaces[number].bounds for number in bodies]), 1, 0)
+    meets = ((low[:, None] < high) & (low < high[:, None])).all(axis=2)
+    if np.count_nonzero(meets) == len(bodies):  # each body meets only itself
+        return [solid]
+    for cavity in surfaces[: len(surfaces) - len(bodies)]:
+        around = (number for number in bodies if points_inside(surfaces[number], cavity.vertices[:1]).all())
+        if (smallest := next(around, None)) is None:
+            return [solid]
+        bodies[smallest].append(cavity)
+    return [join_meshes(body) for body in bodies.values()]
 
 
 def _unite(solids: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:

@@ -65,6 +65,38 @@ def test_touching_solids_form_a_closed_proxy(sections: int, turn: tuple[float, f
     assert proxy.extents == pytest.approx(trimesh.util.concatenate([cap, shaft]).extents, rel=1e-5)
 
 
+def box(size: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
+    return trimesh.creation.box(size, transform=trimesh.transformations.translation_matrix(centre))
+
+
+def cavity(size: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
+    mesh = box(size, centre)
+    mesh.invert()
+    return mesh
+
+
+BLOCK = (0.05, 0.04, 0.03)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "volume"),
+    [
+        # The blocks have 30 x 30 x 20 mm in common.
+        ([box(BLOCK), box(BLOCK, (0.02, 0.01, 0.01))], 2 * 60e-6 - 18e-6),
+        ([box(BLOCK), box(BLOCK, (0.06, 0.0, 0.0))], 2 * 60e-6),
+        ([box(BLOCK), cavity((0.03, 0.02, 0.01))], 60e-6 - 6e-6),
+        # A ball of a rattle inside a cavity.
+        ([box(BLOCK), cavity((0.03, 0.02, 0.01)), box((0.01, 0.01, 0.005))], 60e-6 - 6e-6 + 0.5e-6),
+        # The second block is 10 mm high and covers the cavity of the first one at x > 10 mm: a third of it.
+        ([box(BLOCK), cavity((0.03, 0.02, 0.01)), box((0.05, 0.04, 0.01), (0.03, 0, 0))], 60e-6 + 12e-6 - 4e-6),
+    ],
+)
+def test_bodies_of_one_part_are_united(bodies: list[trimesh.Trimesh], volume: float) -> None:
+    proxy = make_proxy([part(trimesh.util.concatenate(bodies))], 10000)
+    assert proxy.is_volume
+    assert proxy.volume == pytest.approx(volume, rel=1e-5)
+
+
 def test_a_scan_without_some_neighbouring_faces_has_a_closed_proxy() -> None:
     """An open proxy would take the convex decomposition minutes, and have hundreds of pieces."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)

@@ -405,6 +405,15 @@ def test_camera_colours_are_drawn_only_if_the_scene_states_them(random_scene: Sc
     assert 0 <= min(angles) < 60 and 120 < max(angles) <= 180
 
 
+@pytest.mark.parametrize(("balance", "is_drawn"), [(5000.0, False), (6504.0, True), ("auto", True)])
+def test_white_balance_is_drawn_unless_a_temperature_is_stated(
+    balance: float | str, is_drawn: bool, random_scene: Scene
+) -> None:
+    spec = random_scene.spec
+    stated = spec.model_copy(update={"composite": spec.composite.model_copy(update={"white_balance": balance})})
+    assert ("white_balance" in plan_frame(replace(random_scene, spec=stated), 3).draws) == is_drawn
+
+
 def test_random_streams_are_independent() -> None:
     values = [random_stream(*key).random() for key in [(0, "a", 0), (0, "a", 1), (0, "b", 0), (1, "a", 0)]]
     assert len(set(values)) == 4

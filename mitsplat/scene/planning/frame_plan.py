@@ -19,7 +19,7 @@ from mitsplat.scene.planning.conveyor import Belt, belt_of
 from mitsplat.scene.planning.frame_lights import lights_at
 from mitsplat.scene.planning.viewpoints import Viewpoint, check_eye, viewpoint_of
 from mitsplat.scene.scene import Scene
-from mitsplat.scene.spec.image_spec import Randomise
+from mitsplat.scene.spec.image_spec import DAYLIGHT
 from mitsplat.scene.spec.light_spec import EnvironmentLight, LightEntry, LightSpec
 from mitsplat.scene.spec.named_files import light_images
 from mitsplat.scene.spec.scene_spec import SceneSpec
@@ -123,7 +123,6 @@ def plan_frame(
         spec = _with_lights(scene, lights)
     view = index - number * spec.output.views
     time = view / max(1, spec.output.views - 1)
-    ranges = spec.randomise
     viewpoint = viewpoint_of(scene, index, layout) if camera is None else Viewpoint(camera)
     if camera is not None and layout is not None:
         check_eye(scene, index, layout, camera)
@@ -142,7 +141,7 @@ def plan_frame(
         draws={
             name: float(random_stream(spec.seed, name, index).uniform(*bounds))
             for name in _FRAME_DRAWS
-            if (bounds := _range_of(ranges, name)) is not None
+            if (bounds := _range_of(spec, name)) is not None
         },
         seed=int(random_stream(spec.seed, "pixel noise", index).integers(2**31)),
         viewpoint=viewpoint.drawn,
@@ -163,8 +162,11 @@ def _with_lights(scene: Scene, lights: Sequence[LightEntry]) -> SceneSpec:
     return spec
 
 
-def _range_of(ranges: Randomise, name: str) -> tuple[float, float] | None:
+def _range_of(spec: SceneSpec, name: str) -> tuple[float, float] | None:
     """Return the range of a value that is drawn for a frame; None if the scene does not use the value."""
+    ranges = spec.randomise
+    if name == "white_balance" and spec.composite.white_balance not in ("auto", DAYLIGHT):
+        return None
     if name in ("chromatic_aberration", "sharpening") and not any(getattr(ranges, name)):
         return None
     if name in ("chroma_stretch", "chroma_angle") and ranges.chroma_stretch == (1.0, 1.0):

@@ -281,12 +281,9 @@ def check_scene(scene: Scene) -> Iterator[Finding]:
     yield from _check_surfaces(scene)
     yield from _list_mesh_sizes(scene)
     yield from _check_kernel(scene)
-    drawn = (*scene.environments, *scene.assets)
-    lit = bool(spec.lights) or all(asset.capture_light == "scene" for asset in drawn)
-    yield Finding(
-        "light", lit, f"{len(spec.lights)} lights", "add one to lights, or set capture_light: scene in assets"
-    )
-    if lit and not faults:
+    remedy = "add one to lights, or set capture_light: scene in assets"
+    yield Finding("light", scene.is_lit, f"{len(spec.lights)} lights", remedy)
+    if scene.is_lit and not faults:
         yield from check_lamps(scene)
         yield check_exposure(scene)
 

@@ -143,6 +143,9 @@ def write_dataset(
     indices = range(count) if shard is None else shard.frames(count, scene.spec.output.views)
     for warning in lens_warnings(scene.spec):
         _logger.warning("%s: %s: %s", scene.path, warning.text, warning.remedy)
+    if not scene.is_lit:
+        text = "no light is in the scene, so objects have neither shading nor shadows: add one"
+        _logger.warning("%s: lights: %s, or set capture_light: scene in assets", scene.path, text)
     if render is None and settle is None:
         refuse(scene, run_faults(scene, indices, out=out, workers=workers, elsewhere=cluster is not None))
     if cluster is not None:

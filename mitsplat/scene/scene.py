@@ -68,6 +68,12 @@ class Scene:
         """Number of frames: layouts times views. Frames of one layout have consecutive indices."""
         return self.spec.output.layouts * self.spec.output.views
 
+    @property
+    def is_lit(self) -> bool:
+        """True if the scene has lights, or if all assets keep the light of their capture."""
+        drawn = (*self.environments, *self.assets)
+        return bool(self.spec.lights) or all(asset.capture_light == "scene" for asset in drawn)
+
     @cached_property
     def splat_options(self) -> dict[str, Any]:
         """Values of ``spec.rendering`` that refine a preset, with the kernel of the splats if it is not stated."""

@@ -176,6 +176,14 @@ class TestContent:
         write(load_scene(write_scene(scene_data)), tmp_path / "out", frames=1)
         assert (tmp_path / "out/images/train/000000.jpg").read_bytes().startswith(b"\xff\xd8")
 
+    @pytest.mark.parametrize(("light", "number"), [("uniform", 1), ("scene", 0)])
+    def test_a_scene_without_lights_is_reported_once(self, light, number, scene_data, write_scene, tmp_path, caplog):
+        del scene_data["lights"]
+        scene = load_scene(write_scene(scene_data))
+        assets = tuple(replace(asset, capture_light=light) for asset in scene.assets)
+        write_dataset(replace(scene, assets=assets), tmp_path / "data", workers=1, render=render, settle=settle)
+        assert sum("lights: no light is in the scene" in text for text in caplog.messages) == number
+
     def test_the_scene_file_is_stored(self, scene, tmp_path):
         write(scene, tmp_path / "out", frames=1)
         assert (tmp_path / "out/scene/scene.yaml").read_bytes() == scene.path.read_bytes()

@@ -106,7 +106,10 @@ def try_read(output: BinaryIO, read: Callable[[], object]) -> None:
         with np.errstate(all="ignore"):
             read()
     except MemoryError:
-        raise InputError("reading it takes more memory than its file size justifies") from None
+        raise InputError(
+            "reading it takes more memory than its file size justifies: if it has large textures, embed them in a .glb "
+            "or scale them down"
+        ) from None
     except (InputError, MissingResourceError, OSError, *MESH_ERRORS):
         pass
     output.write(b"\n")

@@ -1,8 +1,12 @@
-"""Reading of untrusted images by OpenCV from any path. OpenCV itself crashes on paths that are not UTF-8."""
+"""Reading of untrusted images by OpenCV from any path, and the faults of images that Pillow reads.
+
+OpenCV itself crashes on paths that are not UTF-8.
+"""
 
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 
 import cv2
@@ -34,3 +38,11 @@ def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> AnyArray | None:
 def read_picture_inside(folder: Path, name: str, flags: int = cv2.IMREAD_COLOR) -> AnyArray | None:
     """Return the pixels of an image file as :func:`read_picture`; None also if a link leads out of the folder."""
     return read_picture(folder / name, flags) if is_inside(folder, name) else None
+
+
+def describe_fault(error: Exception) -> str:
+    """Return the reason why Pillow cannot read an image, such as too many pixels."""
+    if isinstance(error, Image.DecompressionBombError):
+        pixels, limit = re.findall(r"\d+", str(error))
+        return f"it must have at most {limit} pixels, got {pixels}"
+    return str(error)

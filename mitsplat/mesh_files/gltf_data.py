@@ -16,6 +16,7 @@ from PIL import Image
 
 from mitsplat.arrays import AnyArray
 from mitsplat.errors import InputError, MissingResourceError
+from mitsplat.images.picture_files import describe_fault
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import item
 from mitsplat.storage.file_kinds import refuse_placeholder
@@ -206,7 +207,7 @@ class GltfData:
             image.load()
         except IMAGE_ERRORS as error:
             raise InputError(
-                f"{self.path}: its {place} cannot be read ({error}); put it there, or give a colour"
+                f"{self.path}: its {place} cannot be read ({describe_fault(error)}); replace it, or give a colour"
             ) from None
         return image
 

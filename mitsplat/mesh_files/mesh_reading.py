@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import trimesh
+from PIL import Image
 
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.geometry.mesh import check_faces
@@ -135,7 +137,8 @@ def read_mesh_file(path: Path, *, textures: bool = True) -> MeshFile:
 
 
 def _read(path: Path, *, textures: bool) -> MeshFile:
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # large textures are valid
         return _READERS.get(path.suffix.lower(), read_with_trimesh)(path, textures=textures)
 
 

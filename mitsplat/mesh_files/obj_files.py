@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from mitsplat.errors import InputError
+from mitsplat.images.picture_files import describe_fault
 from mitsplat.mesh_files.file_references import find_reference
 from mitsplat.mesh_files.mesh_file import MAX_FRACTION, FilePart
 from mitsplat.storage.files import IMAGE_ERRORS
@@ -247,5 +248,5 @@ def check_texture(path: Path, texture: str, folder: Path) -> None:
             image.load()
     except IMAGE_ERRORS as error:
         raise InputError(
-            f"{path}: its texture {texture} cannot be read ({error}); put it there, or give a colour"
+            f"{path}: its texture {texture} cannot be read ({describe_fault(error)}); replace it, or give a colour"
         ) from None

@@ -21,6 +21,7 @@ from PIL import Image, ImageColor
 from mitsplat.arrays import Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.images.colour import decode_srgb
+from mitsplat.images.picture_files import describe_fault
 from mitsplat.mesh_files.mesh_file import PAINTED_MATERIAL, UNKNOWN_COLOUR, FilePart, MeshFile, Texture, Wrap, pixels_of
 from mitsplat.storage.files import IMAGE_ERRORS
 
@@ -337,7 +338,9 @@ class _Package:
             with self._open(path) as file, Image.open(io.BytesIO(file.read())) as image:
                 return Texture(pixels_of(image), uv, wrap)
         except IMAGE_ERRORS as error:
-            raise InputError(f"its texture {path} cannot be read ({error}); give a colour") from None
+            raise InputError(
+                f"its texture {path} cannot be read ({describe_fault(error)}); replace it, or give a colour"
+            ) from None
 
 
 def _local(element: ElementTree.Element) -> str:

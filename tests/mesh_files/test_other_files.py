@@ -12,6 +12,8 @@ from PIL import Image
 from mitsplat.bake.mesh_parts import read_model
 from mitsplat.errors import InputError
 from mitsplat.images.colour import decode_srgb
+from mitsplat.mesh_files.mesh_reading import read_mesh_file
+from tests.mesh_files.glb import sheet
 
 COLOUR = (200, 120, 40)
 UTM = np.array([512345.0, 5401234.0, 310.0])
@@ -52,6 +54,28 @@ def test_paths_of_windows_are_found(tmp_path: Path, library: str, texture: str, 
     (part,) = read_model(write_obj(tmp_path / "box.obj", library)).parts
     shown = part.colours_at(np.arange(12), np.full((12, 3), 1 / 3))
     np.testing.assert_allclose(shown, [decode_srgb(np.array(COLOUR) / 255)] * 12, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["obj", "glb"])
+def test_textures_are_read_up_to_the_limit_of_pixels(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pillow warns above its limit, which is an error in tests, and refuses twice as many pixels."""
+    path = tmp_path / f"box.{kind}"
+    if kind == "glb":
+        glb = sheet()
+        glb.document["images"] = [{"uri": "wood.png"}]
+        glb.save(path)
+    else:
+        (tmp_path / "box.mtl").write_text("newmtl paint\nmap_Kd wood.png\n")
+        write_obj(path, "box.mtl")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 48)
+    Image.new("RGB", (8, 8)).save(tmp_path / "wood.png")
+    texture = read_mesh_file(path).parts[0].material.texture
+    assert texture is not None and texture.pixels.shape == (8, 8, 3)
+    Image.new("RGB", (10, 10)).save(tmp_path / "wood.png")
+    with pytest.raises(InputError, match=r"wood\.png cannot be read \(it must have at most 96 pixels, got 100\);"):
+        read_mesh_file(path)
 
 
 @pytest.mark.parametrize("texture", ["..\\secret.png", "..\\IN\\..\\SECRET.PNG", "none\\wood.png"])

@@ -53,6 +53,7 @@ RULES = {
     "too_short": "must have {min_length} or more items",
     "too_long": "must have {max_length} or fewer items",
     "string_type": "must be text",
+    "string_too_short": "must have {min_length} or more characters",
     "int_type": "must be a whole number",
     "int_from_float": "must be a whole number",
     "float_type": "must be a number",

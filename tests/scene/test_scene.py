@@ -240,6 +240,7 @@ def changed(data: SceneData, **changes: Any) -> SceneData:
         ({"objects__0__pool": ["assets/bolt"]}, "objects[0]: must have either an asset or a pool (got both)"),
         ({"objects__0": {"pool": []}}, "objects[0].pool: must name at least one asset (got [])"),
         ({"objects__0": {"pool": 3}}, "objects[0].pool: must be text (got 3)"),
+        ({"name": ""}, 'name: must have 1 or more characters (got "")'),
         ({"objects__0": {"pool": ["assets/nut", 3]}}, "objects[0].pool[1]: must be text (got 3)"),
         ({"objects__0": {"pool": ["assets/nut", "assets/gone"]}}, "objects[0].pool[1]: "),
         (

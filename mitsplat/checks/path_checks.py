@@ -65,7 +65,7 @@ _ASSET_KEYS: Mapping[str, KeyPath] = {
 """Keys of ``asset.yaml`` by the names of findings."""
 _SCENE_KEYS: Mapping[str, KeyPath] = {
     "formats": ("output", "formats"),
-    **dict.fromkeys(("count", "rest", "settling"), ("objects",)),
+    **dict.fromkeys(("count", "rest", "settling", "size"), ("objects",)),
     **dict.fromkeys(("frames", "memory", "disk"), ("output",)),
     **dict.fromkeys(("visibility", "views", "labels"), ("camera",)),
     **dict.fromkeys(("shape", "bin", "support", "surfaces"), ("shapes",)),

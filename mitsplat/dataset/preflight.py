@@ -116,6 +116,15 @@ def layout_faults(scene: Scene) -> Iterator[Finding]:
                 wrong = "the mesh" if shape.mesh else "its size, in metres"
                 yield fault("shape", str(error), f"correct {wrong}, or set collider: false")
                 return
+    for number, pool in enumerate(scene.pools):
+        for asset in (scene.assets[position] for position in pool):
+            try:
+                if asset.mesh is not None:
+                    check_size(asset.mesh, f"objects[{number}]: {asset.name}")
+            except InputError as error:
+                remedy = f"correct objects[{number}].scale or size, or units in its asset.yaml"
+                yield fault("size", str(error), remedy)
+                return
     for number, (region, arrangements) in enumerate(scene.spec.all_regions):
         where = f"regions[{number - 1}]" if number else "region"
         here = [i for i in dropped if scene.spec.regions_of(scene.spec.objects[i]) == (number,)]

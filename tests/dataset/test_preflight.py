@@ -48,6 +48,10 @@ HOPELESS = {
         {"objects": [{"asset": "assets/nut", "count": 9000}]},
         r"9000 objects of 54 l .* \(its free volume is 28.8 l\)",
     ),
+    "scale": (
+        {"objects": [{"asset": "assets/nut", "scale": 0.001}, {"asset": "assets/bolt"}]},
+        r"objects\[0\]: nut: the mesh must be 0.0005 m to 20.0 m across, .*; correct objects\[0\].scale",
+    ),
     "frames": ({"output": {"layouts": 10**9, "views": 10**9}}, "layouts x views must be at most 2147483647"),
     "disk": ({"output": {"layouts": 10**5, "views": 10**4}}, r"1000000000 images take at least 7629.4 GiB \(10.0 GiB"),
     "buried": ({"region": {"min": [-0.1, -0.1, -0.09], "max": [0.1, 0.1, -0.01]}}, "inside of .*, 'table'"),

@@ -24,7 +24,7 @@ from typer.core import TyperGroup
 from mitsplat.cli import assets, captures, datasets, detectors, exports, fault, inspection, lights, machine, photographs
 from mitsplat.cli.interrupt import handle_interrupts
 from mitsplat.cli.options import parse_strictly
-from mitsplat.errors import LateDeviceError
+from mitsplat.errors import InputError, LateDeviceError
 from mitsplat.runtime.child_process import leave_current_folder, python_command, python_environment
 from mitsplat.storage.file_kinds import check_path_encoding
 from mitsplat.version import __version__
@@ -60,6 +60,19 @@ class _CommandGroup(TyperGroup):
 
     Typer shows headings only with rich markup, in which texts such as ``[px]`` would be read as styles.
     """
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command.
+
+        Raises:
+            InputError: If an argument is missing or a value is invalid, in place of the three lines of Click.
+        """
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            text = error.format_message().replace("Value error, ", "").rstrip(".")
+            help_page = "mitsplat --help" if error.ctx is None else f"{error.ctx.command_path} --help"
+            raise InputError(f"{text[0].lower()}{text[1:]}; see `{help_page}`") from None
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         width = max(len(name) for name in self.commands)

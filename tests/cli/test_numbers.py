@@ -81,3 +81,19 @@ def test_a_known_distance_is_read_as_it_is_written(
     """The number is the last member of a tuple with text."""
     assert run(command, tmp_path, "-o", tmp_path / "out", "--scale-from", "a.jpg", "b.jpg:3,4", text) == 2
     assert f"'--scale-from': METRES must be a number, such as 0.5 (got {text})" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("a.stl", "--up", "x"), "invalid value for '--up': 'x' is not one of 'y', 'z'; see `mitsplat bake --help`"),
+        ((), "missing argument 'MESH'; see `mitsplat bake --help`"),
+    ],
+)
+def test_invalid_values_are_refused_in_one_line(
+    arguments: tuple[str, ...], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("bake", "-o", "out", *arguments) == 2
+    line = capsys.readouterr().err
+    assert line.startswith("mitsplat: ") and line.count("\n") == 1
+    assert sentence.split("; see")[0] in line and "bake --help" in line

@@ -220,7 +220,11 @@ def write_panoptic(files: FrameFiles) -> None:
 
 
 def environment_segment(labels: Labels, ids: npt.NDArray[np.integer]) -> JsonObject | None:
-    """Return id, area and box of the pixels where an id map (H, W) is 0, or None if there are none."""
+    """Return id, area and box of the pixels where an id map (H, W) is 0, or None if there are none.
+
+    The id is that of a panoptic segment. It is 1 above those of all labelled instances, because 0 is void, so that an
+    instance without a label or a distractor can have the same id in other maps.
+    """
     ys, xs = np.nonzero(ids == 0)
     if not len(ys):
         return None

@@ -132,7 +132,8 @@ def is_closed(mesh: trimesh.Trimesh) -> bool:
 
     Four faces share an edge where solids touch, or where a coarse solid touches itself. ``is_watertight`` of trimesh
     is then False, although the volume is defined. Faces that are listed twice would count their solid twice, and both
-    sides of a sheet without thickness enclose nothing: such meshes are not closed.
+    sides of a sheet without thickness enclose nothing: such meshes are not closed. Nor are those with both sides of a
+    whole solid, whose volumes cancel. The faces at which two solids touch end at other faces.
     """
     if mesh.is_watertight:
         return bool(mesh.is_winding_consistent)
@@ -145,7 +146,14 @@ def is_closed(mesh: trimesh.Trimesh) -> bool:
     if len(np.unique(np.column_stack([corners, turns]), axis=0)) < len(corners):
         return False
     one, other = mesh.face_adjacency.T  # the faces of edges that two faces share
-    return not (corners[one] == corners[other]).all(axis=1).any()
+    if (corners[one] == corners[other]).all(axis=1).any():
+        return False
+    _, twin, counts = np.unique(corners, axis=0, return_inverse=True, return_counts=True)
+    sides = edge.reshape(-1, 3)[counts[twin.ravel()] == 2]  # edges of faces that are listed in both directions
+    links = np.concatenate([sides[:, :2], sides[:, 1:]])
+    patch = trimesh.graph.connected_component_labels(links, node_count=len(edges))
+    at_end = np.bincount(sides.ravel(), minlength=len(edges)) == 2
+    return bool(np.isin(patch[sides[:, 0]], patch[at_end]).all())
 
 
 def join_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:

@@ -70,6 +70,15 @@ def test_parts_that_touch_are_split_apart(place: tuple[float, float, float]) -> 
     assert sum(piece.volume for piece in pieces) == pytest.approx(2 * box.volume, rel=1e-5)
 
 
+def test_a_solid_whose_faces_are_also_listed_turned_keeps_its_pieces() -> None:
+    box = trimesh.creation.box((0.05, 0.04, 0.03))
+    both_sides = np.concatenate([box.faces, box.faces[:, ::-1]])
+    other = box.copy().apply_translation((0.2, 0, 0))
+    joint = trimesh.Trimesh(*trimesh.util.append_faces([box.vertices, other.vertices], [both_sides, other.faces]))
+    bounds = np.array([piece.bounds for piece in convex_pieces(joint)])
+    assert (bounds[:, 0].min(axis=0) < box.bounds[0] + 1e-4).all()
+
+
 def test_pieces_are_cached_and_damaged_cache_files_replaced(cache, bracket, caplog):
     shifted = bracket.copy().apply_translation((0.001, 0, 0))  # not in the cache
     first = convex_pieces(shifted)

@@ -170,3 +170,13 @@ def test_faces_listed_twice_turned_or_without_thickness_are_not_closed() -> None
     finned = trimesh.Trimesh(corners, np.concatenate([box.faces, fin]), process=False)
     for mesh in (twice, turned, finned):
         assert not is_closed(mesh)
+
+
+@pytest.mark.parametrize("place", [(0.2, 0, 0), (0.05, 0.04, 0)], ids=["apart", "touching"])
+def test_a_solid_whose_faces_are_also_listed_turned_is_not_closed(place: tuple[float, float, float]) -> None:
+    """Its two volumes cancel each other, so that the mass would be that of the other solid alone."""
+    box = trimesh.creation.box((0.05, 0.04, 0.03))
+    both_sides = np.concatenate([box.faces, box.faces[:, ::-1]])
+    other = box.copy().apply_translation(place)
+    joint = trimesh.Trimesh(*trimesh.util.append_faces([box.vertices, other.vertices], [both_sides, other.faces]))
+    assert not is_closed(joint)

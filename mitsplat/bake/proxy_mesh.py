@@ -83,19 +83,20 @@ def _merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def _simplify(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
     """Simplify a solid to at most about ``most`` faces, or to more faces if only those form a closed surface.
 
-    Quadric decimation may tear meshes such as scans; Manifold simplifies those instead.
+    Quadric decimation may tear meshes such as scans, and keeps many triangles of a plane; Manifold simplifies those
+    instead.
     """
     if len(solid.faces) <= most:
         return solid
     fewer = _without_folds(solid.simplify_quadric_decimation(face_count=most))
-    if fewer.is_volume:
+    if fewer.is_volume and len(fewer.faces) <= most:
         return fewer
     fewest = solid
     for tolerance in _TOLERANCES * solid.scale:
         fewest = min(fewest, simplify_solid(solid, tolerance), key=lambda mesh: len(mesh.faces))
         if len(fewest.faces) <= most:
             return fewest
-    return fewer if is_closed(fewer) else fewest
+    return fewer if is_closed(fewer) and len(fewer.faces) < len(fewest.faces) else fewest
 
 
 def _without_folds(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -107,6 +107,17 @@ def test_a_scan_without_some_neighbouring_faces_has_a_closed_proxy() -> None:
     assert proxy.volume == pytest.approx(ball.volume, rel=0.002)
 
 
+def test_flat_faces_of_many_triangles_are_simplified() -> None:
+    """Quadric decimation keeps most of the 49,152 triangles, because its collapses on a plane would turn triangles."""
+    plate = trimesh.creation.box((0.1, 0.1, 0.002))
+    for _ in range(6):
+        plate = plate.subdivide()
+    proxy = make_proxy([part(plate)], 2000)
+    assert proxy.is_volume
+    assert len(proxy.faces) <= 2000
+    assert proxy.volume == pytest.approx(plate.volume, rel=1e-4)
+
+
 def test_the_proxy_of_a_box_without_a_lid_is_open() -> None:
     box = trimesh.creation.box((0.3, 0.2, 0.1))
     crate = trimesh.Trimesh(box.vertices, box.faces[box.face_normals[:, 2] < 0.5])

@@ -400,7 +400,7 @@ def test_the_highlight_of_a_coarse_sphere_is_where_mitsuba_traces_it(tmp_path: P
     """The path tracer renders the triangles of a PLY file with its normals. Without them, the highlight moves."""
     from mitsplat.plugins import splat_proxy, splats  # registers both plugins  # noqa: F401
 
-    size, metal = 128, {"metallic": 1.0, "roughness": 0.25}
+    size, metal = 256, {"metallic": 1.0, "roughness": 0.25}
     path = ply(tmp_path / "ball", *ball())
     bsdf = {"type": "principled", "base_color": {"type": "rgb", "value": 0.5}, **metal}
     shape = {"type": "ply", "filename": str(path), "bsdf": bsdf}

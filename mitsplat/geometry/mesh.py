@@ -14,6 +14,7 @@ import trimesh
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.mesh_holes import close_holes
+from mitsplat.geometry.mesh_points import points_inside
 
 _logger = logging.getLogger(__name__)
 
@@ -21,6 +22,8 @@ _logger = logging.getLogger(__name__)
 _MIN_SIZE, _MAX_SIZE = 5e-4, 20.0
 # More triangles do not change how an object rests, and CoACD takes hours for them.
 _MAX_FACES = 200_000
+# Share of the volume below which a surface is debris of a scan, whose direction does not matter.
+_MIN_SHARE = 1e-6
 # Minimum angle between faces at an edge that can penetrate another object [rad].
 SHARP = 0.17
 
@@ -89,6 +92,9 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     if volume < 0 and (solid or is_closed(welded)):  # an open scan has no inside
         _logger.warning("%s: the mesh is inside out; physics flips its faces", name)
         welded.invert()
+    if solid and welded.is_watertight and welded.is_winding_consistent:
+        welded = _with_outward_bodies(welded, name)
+        volume = float(welded.volume)
     if solid and abs(volume) < 1e-6 * size**3:
         raise InputError(
             f"{name}: the mesh must enclose a volume (got {abs(volume):.3g} m^3 at {size:g} m across): "
@@ -100,6 +106,31 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
         _logger.warning("%s: physics simplifies the mesh of %d to %d triangles", name, len(welded.faces), _MAX_FACES)
         welded = welded.simplify_quadric_decimation(face_count=_MAX_FACES)
     return welded
+
+
+def _with_outward_bodies(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
+    """Return a closed mesh whose bodies beside others are not inside out; their volumes would be subtracted.
+
+    Surfaces of negative volume inside another surface are cavities, and stay.
+    """
+    surface = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    volumes = np.bincount(surface, weights=np.linalg.det(mesh.triangles - mesh.bounds.mean(axis=0)))
+    faces, flipped = mesh.faces.copy(), 0
+    for number in np.flatnonzero(volumes < -_MIN_SHARE * np.abs(volumes).sum()):
+        own = surface == number
+        rest = trimesh.Trimesh(mesh.vertices, mesh.faces[~own], process=False)
+        if not points_inside(rest, mesh.triangles[own][0, :1]).all():
+            faces[own] = faces[own, ::-1]
+            flipped += 1
+    if not flipped:
+        return mesh
+    _logger.warning(
+        "%s: bodies of the mesh are inside out; physics flips their faces (%d of %d surfaces)",
+        name,
+        flipped,
+        len(volumes),
+    )
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
 
 
 def mass_properties(

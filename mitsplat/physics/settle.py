@@ -40,6 +40,7 @@ MODULES = (
     "geometry.mesh",
     "geometry.mesh_distance",
     "geometry.mesh_holes",
+    "geometry.mesh_points",
     "geometry.rigid",
     *(f"physics.{name}" for name in _PHYSICS_MODULES),
     "scene.planning.contents",

@@ -180,3 +180,22 @@ def test_a_solid_whose_faces_are_also_listed_turned_is_not_closed(place: tuple[f
     other = box.copy().apply_translation(place)
     joint = trimesh.Trimesh(*trimesh.util.append_faces([box.vertices, other.vertices], [both_sides, other.faces]))
     assert not is_closed(joint)
+
+
+def test_a_body_inside_out_beside_another_is_flipped_and_a_cavity_is_not(caplog: pytest.LogCaptureFixture) -> None:
+    body, beside = trimesh.creation.box((0.05, 0.04, 0.03)), trimesh.creation.box((0.02, 0.02, 0.02))
+    cavity = trimesh.creation.box((0.01, 0.01, 0.01))
+    beside.apply_translation((0.2, 0, 0))
+    expected = body.volume + beside.volume - cavity.volume
+    beside.invert()
+    cavity.invert()
+    joint = trimesh.util.concatenate([body, beside, cavity])
+    assert prepare_mesh(joint, "part").volume == pytest.approx(expected)
+    assert caplog.messages == ["part: bodies of the mesh are inside out; physics flips their faces (1 of 3 surfaces)"]
+
+
+def test_a_body_and_its_equal_inside_out_have_a_volume() -> None:
+    body = trimesh.creation.box((0.05, 0.04, 0.03))
+    other = body.copy().apply_translation((0.2, 0, 0))
+    other.invert()
+    assert prepare_mesh(trimesh.util.concatenate([body, other]), "part").volume == pytest.approx(2 * body.volume)

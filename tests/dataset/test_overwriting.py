@@ -125,7 +125,7 @@ def test_folds_are_removed_when_images_are_added(
     assert len(list(out.rglob("fold*_train.txt"))) == 4  # two tasks
     write(scene, out)
     assert not list(out.rglob("fold*_*")) and not list(out.rglob("folds"))
-    assert caplog.messages == [
+    assert [message for message in caplog.messages if "no light" not in message] == [
         f"{out}: the lists of folds do not contain the new images and are removed: run `mitsplat split` again"
     ]
     write_folds(out, 3)

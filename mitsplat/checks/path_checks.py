@@ -188,9 +188,10 @@ def _mesh(asset: Asset, core: Float64Array) -> Iterator[Finding]:
         f"splats are shifted by {offset.shift:.2%} and off by {offset.spread:.2%} of the mesh's diagonal",
         "register the mesh to the splats: `mitsplat mesh --import`",
     )  # fmt: skip
+    closed = is_closed(mesh)
     yield Finding(
-        "watertightness", is_closed(mesh) or asset.kind == "environment",
-        "closed" if is_closed(mesh) else "open",
+        "watertightness", closed or asset.kind == "environment",
+        "closed" if closed else "open",
         "close it (`mitsplat mesh`, or a mesh editor); otherwise mass and inertia are those of its convex pieces",
     )  # fmt: skip
     if asset.kind == "object":

@@ -240,11 +240,11 @@ def test_lobes_of_pixels_include_the_spread_of_normals() -> None:
     values |= {"normal": mi.Vector3f(normal.T.astype(np.float32)), "to_camera": mi.Vector3f(to_camera)}
     values |= {"trait": mi.Float(trait), "roughness": mi.Float(roughness.astype(np.float32))}
     got = footprint.filtered_lobes(LitSurface(**values), mi.UInt32(index), mi.UInt32(place), view)
-    spread, own = np.array(got.spread, np.float64).T, np.array(got.roughness, np.float64)
+    bend, own = np.array(got.bend, np.float64).T, np.array(got.roughness, np.float64)
     tangents = np.eye(3) - np.einsum("ni,nj->nij", normal, normal)
-    slopes = own[:, None, None] ** 4 * tangents + np.einsum("ni,nj->nij", spread, spread)
+    slopes = own[:, None, None] ** 4 * tangents + np.einsum("ni,nj->nij", bend, bend)
     np.testing.assert_allclose(slopes, expected, rtol=1e-3, atol=1e-5)
-    assert np.mean(np.linalg.norm(spread, axis=1) > 0.05) > 0.5
+    assert np.mean(np.linalg.norm(bend, axis=1) > 0.05) > 0.5
     assert np.mean(own > roughness + 1e-3) > 0.3
 
 

@@ -41,9 +41,9 @@ def lobe(
 ) -> SpecularLobe:
     """``principled`` has the GGX parameters roughness^2 / aspect and roughness^2 aspect."""
     aspect = np.sqrt(1 - 0.9 * anisotropic)
-    spread = roughness**2 * np.sqrt(1 / aspect**2 - aspect**2)
+    bend = roughness**2 * np.sqrt(1 / aspect**2 - aspect**2)
     parameters = mi.Float(float(roughness * np.sqrt(aspect))), mi.Float(metallic), mi.Float(specular)
-    return SpecularLobe.of(mi.Vector3f(0, 0, 1), view, *parameters, mi.Vector3f(float(spread), 0, 0))
+    return SpecularLobe.of(mi.Vector3f(0, 0, 1), view, *parameters, mi.Vector3f(float(bend), 0, 0))
 
 
 def reflected(view: mi.Vector3f, light: mi.Vector3f, case: Case) -> npt.NDArray[np.float64]:

@@ -230,10 +230,10 @@ def filtered_lobes(here: LitSurface, index: mi.UInt32, place: mi.UInt32, view: C
     along = a * dr.cos(angle) + b * dr.sin(angle)
     excess = 2 * radius * share
     length = dr.norm(along)
-    spread = dr.select((excess > 0) & (length > 0), along * (dr.sqrt(excess) / length), 0)
+    bend = dr.select((excess > 0) & (length > 0), along * (dr.sqrt(excess) / length), 0)
     across = dr.maximum(mean - radius, 0) * share
     roughness = dr.select(across > 0, dr.sqrt(dr.sqrt(dr.power(here.roughness, 4) + across)), here.roughness)
-    return replace(here, roughness=roughness, spread=spread)
+    return replace(here, roughness=roughness, bend=bend)
 
 
 def _neighbour(

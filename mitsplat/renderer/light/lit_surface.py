@@ -41,7 +41,7 @@ class LitSurface:
         instance: Instance id (Float).
         trait: Row of the shape in :class:`Traits` (Float). Light is not averaged across rows.
         relit: True if the point is relit (uniform capture), False if it is only shadowed.
-        roughness, metallic, specular, spread: Parameters of
+        roughness, metallic, specular, bend: Parameters of
             :class:`mitsplat.renderer.materials.principled.SpecularLobe`.
         captured: True if the colour contains the mirror image of the light of the capture.
         known: True if the point comes from the proxy of the visible instance, or see :func:`is_raised`; otherwise
@@ -61,7 +61,7 @@ class LitSurface:
     roughness: mi.Float
     metallic: mi.Float
     specular: mi.Float
-    spread: mi.Vector3f
+    bend: mi.Vector3f
     captured: mi.Bool
     known: mi.Bool
     valid: mi.Bool
@@ -79,7 +79,7 @@ class LitSurface:
     @property
     def lobe(self) -> SpecularLobe:
         """Specular lobes towards the camera."""
-        return SpecularLobe.of(self.normal, self.to_camera, self.roughness, self.metallic, self.specular, self.spread)
+        return SpecularLobe.of(self.normal, self.to_camera, self.roughness, self.metallic, self.specular, self.bend)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +230,7 @@ class VisibleSurfaces:
             roughness=roughness,
             metallic=dr.select(seen.mesh, 0, metallic),
             specular=dr.select(seen.mesh, 0, specular),
-            spread=dr.zeros(mi.Vector3f, dr.width(position)),
+            bend=dr.zeros(mi.Vector3f, dr.width(position)),
             captured=captured,
             known=known,
             valid=valid,

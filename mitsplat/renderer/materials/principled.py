@@ -74,17 +74,17 @@ class SpecularLobe:
         roughness: mi.Float,
         metallic: mi.Float,
         specular: mi.Float,
-        spread: mi.Vector3f | None = None,
+        bend: mi.Vector3f | None = None,
     ) -> SpecularLobe:
         """Return the lobes of points with unit ``normal`` and unit vector ``to_camera``.
 
-        ``spread`` is a tangent in whose direction the squared GGX parameter is larger by the squared length.
+        ``bend`` is a tangent in whose direction the squared GGX parameter is larger by the squared length.
         """
         frame = mi.Frame3f(mi.Normal3f(normal))
         alpha = mi.Vector2f(dr.maximum(dr.square(roughness), MIN_ALPHA))
-        if spread is not None:
-            length2 = dr.squared_norm(spread)
-            along = dr.select(length2 > 0, dr.normalize(spread), frame.s)
+        if bend is not None:
+            length2 = dr.squared_norm(bend)
+            along = dr.select(length2 > 0, dr.normalize(bend), frame.s)
             frame = mi.Frame3f(along, dr.cross(normal, along), normal)
             alpha.x = dr.sqrt(dr.square(alpha.x) + length2)
         view = frame.to_local(to_camera)

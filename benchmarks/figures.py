@@ -177,8 +177,8 @@ def filled(text: str, results: Results) -> str:
                     return runs(result for result in results.values() if "command" in result)
                 case ["detectors", *plan_and_arms]:
                     return experiment_table(results, *plan_and_arms)
-                case ["detector", plan, arm]:
-                    return f"{mean_precision(results, plan, arm):.3f}"
+                case ["detector", plan, arm, *figure] if len(figure) < 2:
+                    return f"{mean_precision(results, plan, arm, *figure):.3f}"
                 case ["detector_interval", plan, arm]:
                     return precision_interval(results, plan, arm)
                 case ["gain", plan, arm, baseline]:

@@ -55,13 +55,13 @@ def precision_draws(results: Mapping[str, Mapping[str, Any]], plan: str = "arms"
     }
 
 
-def mean_precision(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str) -> float:
-    """Return the mean over the seeds of an arm.
+def mean_precision(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str, figure: str = "map50_95") -> float:
+    """Return the mean of a figure over the seeds of an arm.
 
     Raises:
         KeyError: If there is none.
     """
-    return _mean(_by_arm(results, plan, arm)[arm], "map50_95")
+    return _mean(_by_arm(results, plan, arm)[arm], figure)
 
 
 def precision_interval(results: Mapping[str, Mapping[str, Any]], plan: str, arm: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +20,7 @@ from pycocotools.coco import COCO
 from ruamel.yaml import YAML
 
 from mitsplat.errors import InputError
-from mitsplat.formats import coco, maps
+from mitsplat.formats import bop, coco, maps
 from mitsplat.formats.registry import Catalogue, CollectionWriter, write_frame
 from mitsplat.formats.yolo import rotated_box
 from mitsplat.geometry.camera import Camera
@@ -40,7 +40,11 @@ WIDTH, HEIGHT = 160, 120
 CLASSES = ("bolt", "nut")
 KEYPOINTS = (("head", "tip"), ("middle",))
 POINTS = {0: np.array([[0.0, 0, 0], [0, 0, -0.05]]), 1: np.array([[0.01, 0, 0]])}
-CAMERA = Camera.look_at((0, 0, 1), (0, 0, 0), up=(0, 1, 0), width=WIDTH, height=HEIGHT, fov_x=60)
+LENS = {"fy": 150.0, "cx": 76.0, "cy": 63.0}
+"""Pixels that are not square, and a principal point beside the middle."""
+CAMERA = replace(Camera.look_at((0, 0, 1), (0, 0, 0), up=(0, 1, 0), width=WIDTH, height=HEIGHT, fov_x=60), **LENS)
+LATER_CAMERA = Camera.look_at((0.1, 0, 1), (0, 0, 0), up=(0, 1, 0), width=WIDTH, height=HEIGHT, fov_x=50)
+"""Camera of the frames from index 8 on."""
 
 
 def disc(ids: np.ndarray, centre: tuple[int, int], radius: int, value: int) -> np.ndarray:
@@ -101,7 +105,7 @@ LAYOUTS = {
 
 def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> Any:
     """Build the frame that a renderer would make of the drawing."""
-    ids = drawn.ids
+    ids, camera = drawn.ids, CAMERA if index < 8 else LATER_CAMERA
     rng = np.random.default_rng(index)
     instances = []
     for number in drawn.covered:
@@ -111,16 +115,17 @@ def frame_of(drawn: Drawn, index: int, *, rules: LabelRules | None = None) -> An
     silhouettes = {number: Silhouette.cropped(mask, x, y) for number, (mask, x, y) in drawn.covered.items()}
     depth = np.where(ids > 0, 0.8, 1.0).astype(np.float32)
     labels = label_instances(
-        Truth(ids, ids, silhouettes, depth), instances, CLASSES, rules or LabelRules(), camera=CAMERA, keypoints=POINTS
+        Truth(ids, ids, silhouettes, depth), instances, CLASSES, rules or LabelRules(), camera=camera, keypoints=POINTS
     )
-    following = Camera.look_at((0.05, 0, 1), (0.05, 0, 0), up=(0, 1, 0), width=WIDTH, height=HEIGHT, fov_x=60)
+    pose = camera.world_from_camera.copy()
+    pose[:3, 3] += 0.05 * pose[:3, 0]
     plan = SimpleNamespace(
         index=index,
         layout=index // 2,
         view=index % 2,
         split="train" if index % 4 < 2 else "val",
-        camera=CAMERA,
-        next_camera=following,
+        camera=camera,
+        next_camera=replace(camera, world_from_camera=pose),
         lights=(),
         draws={},
         seed=index,
@@ -288,7 +293,7 @@ class TestYolo:
                 assert len(row) == 5 + 3 * 2
                 points = np.array(row[5:]).reshape(2, 3)
                 pose = label.world_from_object
-                expected, _ = CAMERA.project(POINTS[label.asset] @ pose[:3, :3].T + pose[:3, 3])
+                expected, _ = frame.camera.project(POINTS[label.asset] @ pose[:3, :3].T + pose[:3, 3])
                 for (x, y, visibility), place in zip(points, expected, strict=False):
                     seen.add(int(visibility))
                     if visibility:
@@ -396,7 +401,7 @@ class TestCoco:
         for frame, record in written.pairs:
             if record["split"] == "train":
                 for label, entry in zip(frame.labels.instances, frames[frame.index]["instances"], strict=True):
-                    expected = CAMERA.camera_from_world @ label.world_from_object
+                    expected = frame.camera.camera_from_world @ label.world_from_object
                     np.testing.assert_allclose(entry["camera_from_object"], expected, atol=1e-12)
                     assert entry["object"] == label.asset
 
@@ -433,7 +438,7 @@ class TestBop:
                 points = MESHES[pose["obj_id"] - 1].vertices
                 local = 1000 * points @ rotation.T + shift
                 projected = local @ intrinsics.T
-                expected, _ = CAMERA.project(trimesh.transform_points(points, label.world_from_object))
+                expected, _ = frame.camera.project(trimesh.transform_points(points, label.world_from_object))
                 np.testing.assert_allclose(projected[:, :2] / projected[:, 2:] + 0.5, expected, atol=1e-6)
 
     @staticmethod
@@ -451,6 +456,16 @@ class TestBop:
         (fx, _, cx), (_, fy, cy), _ = np.reshape(scene["cam_K"], (3, 3))
         assert (camera["fx"], camera["fy"], camera["cx"], camera["cy"]) == (fx, fy, cx, cy)
         assert camera["depth_scale"] == scene["depth_scale"]
+        assert (fx, fy, cx, cy) == (CAMERA.fx, CAMERA.fy, CAMERA.cx - 0.5, CAMERA.cy - 0.5)
+
+    def test_a_second_visit_of_a_scene_is_refused(self, written: Written, tmp_path: Path) -> None:
+        """Its files would replace those of the first visit, and labels would be lost."""
+        writer = bop.ScenesWriter(tmp_path, Catalogue(CLASSES, KEYPOINTS, ("bolt", "nut"), MESHES))
+        for index in (0, 2, 4):  # layouts 0, 1 and 2
+            writer.add(written.records[index])
+        with pytest.raises(ValueError, match=r"must be added by ascending layout \(got 1 after 2\)"):
+            writer.add(written.records[3])
+        writer.discard()
 
     def test_models_are_in_millimetres_with_their_extents(self, written: Written) -> None:
         info = json.loads((written.root / "bop/models/models_info.json").read_text())
@@ -518,7 +533,7 @@ class TestMaps:
         for frame, record in written.pairs:
             flow = cv2.readOpticalFlow(str(written.root / f"flow/{record['split']}/{frame.index:06d}.flo"))
             assert flow.shape == (HEIGHT, WIDTH, 2)
-            np.testing.assert_allclose(flow[..., 0], -CAMERA.fx * 0.05 / frame.depth, rtol=1e-4)
+            np.testing.assert_allclose(flow[..., 0], -frame.camera.fx * 0.05 / frame.depth, rtol=1e-4)
             np.testing.assert_allclose(flow[..., 1], 0, atol=1e-4)
 
     def test_flow_is_unknown_where_depth_is_missing(self) -> None:
@@ -539,10 +554,10 @@ def test_pycolmap_reads_the_cameras_of_the_frames(written: Written) -> None:
     )
     images = {name: (np.array(pose), np.array(intrinsics)) for name, pose, intrinsics in json.loads(done.stdout)}
     assert len(images) == len(written.records)
-    for record in written.records:
+    for frame, record in written.pairs:
         pose, intrinsics = images[f"{record['split']}/{record['index']:06d}.png"]
-        np.testing.assert_allclose(pose, CAMERA.camera_from_world[:3], atol=1e-12)
-        np.testing.assert_allclose(intrinsics, CAMERA.intrinsics)
+        np.testing.assert_allclose(pose, frame.camera.camera_from_world[:3], atol=1e-12)
+        np.testing.assert_allclose(intrinsics, frame.camera.intrinsics)
 
 
 class TestCatalogue:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from mitsplat.audit.bop_check import BopCheck
 from mitsplat.audit.dataset_check import Violation
 from mitsplat.audit.decoded_frame import DecodedFrame
 from mitsplat.dataset.write import write_dataset
+from mitsplat.scene.spec.camera_spec import Intrinsics
 from tests.conftest import BOTH, box_asset, small_scene
 from tests.drawn import render_boxes, scatter_boxes
 from tests.manifests import records_of
@@ -29,6 +31,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bop")
     rods = [box_asset("nut", (0.3, 0.06, 0.05)), box_asset("bolt", (0.05, 0.06, 0.3))]
     scene = small_scene(folder, rods, BOTH, layouts=3, views=2, formats=["bop"])
+    lens = scene.spec.camera.model_copy(update={"intrinsics": Intrinsics(fx=58.0, fy=66.0, cx=30.0, cy=26.0)})
+    scene = replace(scene, spec=scene.spec.model_copy(update={"camera": lens}))
     return write_dataset(scene, folder / "out", render=render_boxes, settle=scatter_boxes).path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -366,7 +367,12 @@ class TestCoco:
                     assert isinstance(entry["segmentation"], list) == (name == "polygons")
                     np.testing.assert_array_equal(coco_mask.toBbox(read.annToRLE(entry)), entry["bbox"])
                     assert (entry["area"], entry["category_id"]) == (expected.sum(), label.class_index + 1)
-                    assert len(entry["keypoints"]) == 3 * len(KEYPOINTS[label.class_index])
+                    points, pose = np.reshape(entry["keypoints"], (-1, 3)), label.world_from_object
+                    labelled = points[:, 2] > 0
+                    assert entry["num_keypoints"] == np.count_nonzero(labelled)  # hidden ones too
+                    places, _ = frame.camera.project(POINTS[label.asset] @ pose[:3, :3].T + pose[:3, 3])
+                    np.testing.assert_allclose(points[labelled, :2], places[labelled], atol=0.01)
+                    assert not points[~labelled].any()
                     if name == "amodal":
                         np.testing.assert_array_equal(
                             coco_mask.decode(entry["visible_segmentation"]), whole(label, (HEIGHT, WIDTH))
@@ -458,6 +464,13 @@ class TestBop:
         assert camera["depth_scale"] == scene["depth_scale"]
         assert (fx, fy, cx, cy) == (CAMERA.fx, CAMERA.fy, CAMERA.cx - 0.5, CAMERA.cy - 0.5)
 
+    def test_a_frame_of_a_distorted_lens_is_refused(self, written: Written) -> None:
+        """Frames made in Python can have any camera, but BOP has no distortion."""
+        camera = replace(CAMERA, distortion=(0.1, 0.0, 0.0, 0.0))
+        frame = SimpleNamespace(index=3, camera=camera, labels=written.frames[0].labels)
+        with pytest.raises(InputError, match=r"^frame 3: bop must have a camera without lens distortion \(got \[0\.1"):
+            bop.write(SimpleNamespace(frame=frame))  # type: ignore[arg-type]
+
     def test_a_second_visit_of_a_scene_is_refused(self, written: Written, tmp_path: Path) -> None:
         """Its files would replace those of the first visit, and labels would be lost."""
         writer = bop.ScenesWriter(tmp_path, Catalogue(CLASSES, KEYPOINTS, ("bolt", "nut"), MESHES))
@@ -472,6 +485,8 @@ class TestBop:
         for number, mesh in enumerate(MESHES, start=1):
             back = trimesh.load_mesh(written.root / f"bop/models/obj_{number:06d}.ply")
             np.testing.assert_allclose(back.bounds, 1000 * mesh.bounds, atol=1e-3)
+            head = (written.root / f"bop/models/obj_{number:06d}.ply").read_text().split("end_header")[0]
+            assert re.findall(r"property float (\w+)", head) == ["x", "y", "z", "nx", "ny", "nz"]  # normals for shading
             distances = np.linalg.norm(mesh.vertices[:, None] - mesh.vertices[None], axis=-1)
             assert info[str(number)]["diameter"] == pytest.approx(1000 * distances.max())
             assert info[str(number)]["size_y"] == pytest.approx(1000 * mesh.extents[1])

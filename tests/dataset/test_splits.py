@@ -95,8 +95,29 @@ def test_folds_list_existing_images_and_labels(made: Path, capsys: pytest.Captur
             assert len(coco.anns) == sum(len(record["labels"]["instances"]) for record in shown)
     assert sorted(validated) == sorted({record["layout"] for record in records})
     assert audit_dataset(made).violations == ()
-    with pytest.raises(InputError, match=r"folds must be 2 to 6, the layouts of .* \(got 7\)"):
-        write_folds(made, 7)
+    for folds in (1, 7):
+        with pytest.raises(InputError, match=rf"folds must be 2 to 6, the layouts of .* \(got {folds}\)"):
+            write_folds(made, folds)
+
+
+def test_folds_state_their_images_and_instances(made: Path) -> None:
+    for number, fold in enumerate(write_folds(made, 4), start=1):
+        names = (made / f"fold{number}_val.txt").read_text().split()
+        shown = [record for record in records_of(made) if any(f"./{file}" in names for file in record["files"])]
+        classes = Counter(label["class"] for record in shown for label in record["labels"]["instances"])
+        assert (fold.images, fold.instances) == (len(names), dict(classes))
+        assert fold.layouts == len({record["layout"] for record in shown})
+
+
+def test_folds_of_four_layouts_have_equal_counts() -> None:
+    """Large layouts are assigned first and small ones complete them; without a difference, the first fold is taken."""
+    layouts = {
+        0: Counter({"rare": 1, "common": 1}),
+        1: Counter({"rare": 1, "common": 3}),
+        2: Counter({"common": 3}),
+        3: Counter({"common": 1}),
+    }
+    assert assign_folds(layouts, 2) == {1: 0, 0: 1, 2: 1, 3: 0}
 
 
 def test_a_dataset_of_one_layout_has_no_folds(tmp_path: Path) -> None:

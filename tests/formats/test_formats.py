@@ -401,6 +401,11 @@ class TestCoco:
                 (stuff,) = (s for s in segments.values() if not kinds[s["category_id"]]["isthing"])
                 np.testing.assert_array_equal(ids == stuff["id"], frame.instance == 0)
 
+    def test_the_environment_segment_has_the_bounds_of_its_pixels(self) -> None:
+        frame = frame_of(Drawn({1: block(0, 0, 160, 80), 2: block(0, 80, 30, 120), 3: block(100, 80, 160, 120)}), 0)
+        environment = coco.environment_segment(frame.labels, frame.instance)
+        assert environment == {"id": 4, "area": 70 * 40, "box": [30, 80, 100, 120]}
+
     def test_poses_equal_those_of_the_labels(self, written: Written) -> None:
         content = json.loads((written.root / "annotations/poses_train.json").read_text())
         frames = {entry["id"]: entry for entry in content["frames"]}

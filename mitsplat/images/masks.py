@@ -130,12 +130,13 @@ def boundary_f1(one: BoolArray, other: BoolArray) -> float:
 
 def disc(radius: int) -> npt.NDArray[np.uint8]:
     """Return a disc with a radius r [px] as a structuring element of OpenCV, shape (2 r + 1, 2 r + 1)."""
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2), dtype=np.uint8)
+    squares = np.arange(-radius, radius + 1) ** 2  # OpenCV's own discs are wider than high
+    return (squares + squares[:, None] <= radius**2).astype(np.uint8)
 
 
 def fill_hull(picture: npt.NDArray[np.uint8], pixels: Float64Array) -> None:
-    """Set a picture to 1 in the convex hull of pixels (N, 2)."""
-    cv2.fillConvexPoly(picture, np.rint(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32), 1)
+    """Set a picture to 1 in the pixels of the convex hull of positions (N, 2), which have pixel centres at +0.5."""
+    cv2.fillConvexPoly(picture, np.floor(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32), 1)
 
 
 def border_of(image: AnyArray) -> AnyArray:

@@ -161,6 +161,28 @@ def test_faults_of_a_coco_file_are_one_sentence(
         read_set(coco(tmp_path, annotation, **more), "train")
 
 
+def test_classes_of_several_coco_files_are_matched_by_name(tmp_path: Path) -> None:
+    """Tools number the categories of each export in the order of their first label."""
+    root = coco(tmp_path, {"category_id": 2})
+    content = json.loads((root / "train.json").read_text())
+    content["images"][0]["file_name"] = "other.png"
+    content["categories"] = [{"id": 1, "name": "bolt"}, {"id": 2, "name": "nut"}]
+    (root / "val.json").write_text(json.dumps(content))
+    (root / "other.png").write_bytes((root / f"{NAME}.png").read_bytes())
+    found = read_set(root, "all")
+    names = {sample.name: found.class_names[sample.instances[0].class_index] for sample in found.samples}
+    assert names == {f"{NAME}.png": "bolt", "other.png": "nut"}
+
+
+def test_boxes_alone_count_once_each(tmp_path: Path) -> None:
+    boxes = [[40, 30, 20, 10], [10, 30, 20, 10], [40, 30, 20, 10], [5, 5, 1, 1]]
+    annotations = [{"id": i, "image_id": 1, "category_id": 1, "bbox": box} for i, box in enumerate(boxes)]
+    (sample,) = read_set(coco(tmp_path / "four", {}, annotations=annotations), "train").samples
+    assert [one.box for one in sample.instances] == [(40, 30, 60, 40), (10, 30, 30, 40), (5, 5, 6, 6)]
+    (fewer,) = read_set(coco(tmp_path / "three", {}, annotations=annotations[:3]), "train").samples
+    assert sample.digest != fewer.digest
+
+
 def test_images_are_found_in_the_unicode_form_of_macos(tmp_path: Path) -> None:
     image = {"id": 1, "file_name": unicodedata.normalize("NFD", f"{NAME}.png")}
     assert len(read_set(coco(tmp_path, {}, images=[image]), "train").samples) == 1

@@ -105,7 +105,7 @@ def rerender_frame(
     differing = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
     if stored != {**json.loads(json.dumps(record)), "files": before}:
         differing.append(MANIFEST)
-    if (dataset / file).is_file() and (dataset / file).read_bytes() != text.encode():
+    if not (dataset / file).is_file() or (dataset / file).read_bytes() != text.encode():
         differing.append(file)
     difference = first_difference(
         DEFAULT_CONTENT | read_json(dataset / CONTENT), content_of(scene, catalogue, used_device.kind)

@@ -16,6 +16,7 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
 from tests.conftest import BOTH, WriteScene, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
+from tests.manifests import records_of
 
 DRAWN: dict[str, Any] = {"render": render_boxes, "settle": scatter_boxes}
 
@@ -61,6 +62,41 @@ def test_files_that_differ_are_named_with_the_cause(scene: Scene, made: Path, tm
         rerender_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN)
 
 
+@pytest.mark.parametrize(
+    ("formats", "file"),
+    [("coco bop", "labels/train/000001.txt"), ("yolo coco bop instances", "instances/train/000001.png")],
+)
+def test_files_of_other_formats_are_named(scene: Scene, made: Path, tmp_path: Path, formats: str, file: str) -> None:
+    output = scene.spec.output.model_copy(update={"formats": tuple(formats.split())})
+    other = replace(scene, spec=scene.spec.model_copy(update={"output": output}))
+    again = rerender_frame(other, 1, tmp_path / "again", dataset=made, **DRAWN)
+    stored = records_of(made)[1]["files"]
+    assert file in again.differing and set(again.differing) == stored.keys() ^ again.record["files"].keys()
+    assert again.compared == len(stored)
+
+
+def test_a_missing_layout_is_named(scene: Scene, made: Path, tmp_path: Path) -> None:
+    (made / "layouts/0000.json").unlink()
+    assert rerender_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN).differing == ("layouts/0000.json",)
+
+
+def test_links_to_other_folders_are_refused(scene: Scene, tmp_path: Path) -> None:
+    rerender_frame(scene, 1, tmp_path / "again", **DRAWN)
+    (tmp_path / "again/layouts").rename(tmp_path / "outside")
+    (tmp_path / "again/layouts").symlink_to(tmp_path / "outside")
+    with pytest.raises(InputError, match="link"):
+        rerender_frame(scene, 2, tmp_path / "again", **DRAWN)
+    assert [path.name for path in (tmp_path / "outside").iterdir()] == ["0000.json"]
+
+
+def test_files_of_an_earlier_frame_are_removed(scene: Scene, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    for index in (1, 2):
+        files = {*rerender_frame(scene, index, again, **DRAWN).record["files"], "frame.json"}
+    files.add("layouts/0001.json")
+    assert {str(path.relative_to(again)) for path in again.rglob("*") if path.is_file()} == files
+
+
 def test_a_frame_that_the_dataset_lacks_is_not_compared(scene: Scene, made: Path, tmp_path: Path) -> None:
     for index, dataset in ((3, made), (1, tmp_path / "none"), (1, None)):
         again = rerender_frame(scene, index, tmp_path / f"again{index}", dataset=dataset, **DRAWN)
@@ -70,6 +106,8 @@ def test_a_frame_that_the_dataset_lacks_is_not_compared(scene: Scene, made: Path
 def test_a_folder_with_other_files_is_refused(scene: Scene, made: Path) -> None:
     with pytest.raises(InputError, match="must be absent, empty, or hold a frame of an earlier call"):
         rerender_frame(scene, 1, made, **DRAWN)
+    with pytest.raises(InputError, match="must be absent, empty, or hold a frame of an earlier call"):
+        rerender_frame(scene, 1, made / "dataset.json", **DRAWN)
     with pytest.raises(InputError, match="frame must be in 0 to 3"):
         rerender_frame(scene, 4, made, **DRAWN)
 

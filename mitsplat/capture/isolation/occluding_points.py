@@ -57,8 +57,8 @@ def occluded_part(camera: Camera, own: Float64Array, others: Sequence[Float64Arr
     middle = float(np.median(depths))
     for points in others:
         pixels, depths = camera.project(points)
-        near = placed(pixels[(depths > 0) & (depths < middle)])
-        near = near[((near >= 0) & (near < edge)).all(axis=1)]
+        near = placed(pixels[depths < middle])
+        near = near[((near >= 0) & (near < edge)).all(axis=1)]  # points behind the camera have no pixel
         if len(near) < 4:
             continue
         gap = round(float(np.clip(2 * np.median(KDTree(near).query(near, k=4)[0][:, -1]), *_GAPS)))

@@ -12,6 +12,7 @@ from mitsplat.capture.isolation import PhotoView, Pick, choose_object
 from mitsplat.capture.isolation.object_choice import focus_of
 from mitsplat.capture.isolation.support import find_support
 from mitsplat.errors import InputError
+from mitsplat.geometry.camera import Camera
 from tests.capture.isolation.balls import THINGS, ground, three_balls
 
 
@@ -58,16 +59,42 @@ def test_the_object_in_the_focus_of_the_cameras_is_chosen(
     assert len(found.above) > 0.85 * np.count_nonzero(labels == 1)
     feet = found.points[len(found.above) :]
     assert np.abs(feet[:, 2] - ground(feet)).max() < 0.006
+    assert 10 < len(feet) < 0.3 * len(found.above)  # the lowest 15 % of a ball
+
+
+def test_the_focus_is_the_point_at_which_most_cameras_are_directed() -> None:
+    turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    targets = [(0.5, 0.5, 0.0) if number % 4 == 0 else (0.1, 0.0, 0.03) for number in range(12)]
+    eyes = np.column_stack([np.cos(turns), np.sin(turns), np.full(12, 0.5)])
+    cameras = [Camera.look_at(e, aim, width=320, height=240, fov_x=60) for e, aim in zip(eyes, targets, strict=True)]
+    focus, distance = focus_of(cameras)
+    np.testing.assert_allclose(focus, (0.1, 0.0, 0.03), atol=0.01)
+    assert distance == pytest.approx(np.median(np.linalg.norm(eyes - (0.1, 0.0, 0.03), axis=1)), abs=0.01)
 
 
 def test_picks_and_a_box_choose_another_object(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
     points, _, views = place
     assert ball_of(choose_object(points, views, picks=[pick(place, 3)]).above, place) == {3}
-    both = choose_object(points, views, picks=[pick(place, 1), pick(place, 2)])
+    picks = [pick(place, 1), pick(place, 2)]
+    both = choose_object(points, views, picks=picks)
     assert ball_of(both.above, place) == {1, 2}
+    assert ball_of(choose_object(points, views, picks=picks, picks_not=[pick(place, 2)]).above, place) == {1}
     assert ball_of(choose_object(points, views, picks_not=[pick(place, 1)]).above, place) <= {2, 3}
-    boxed = choose_object(points, views, box=(0.1, -0.05, -0.02, 0.25, 0.1, 0.15))
-    assert ball_of(boxed.above, place) == {2}
+    for low, high in ((-0.02, 0.15), (-1.0, 1.0)):
+        boxed = choose_object(points, views, box=(0.1, -0.05, low, 0.25, 0.1, high))
+        assert ball_of(boxed.above, place) == {2}
+
+
+def test_points_that_few_photos_observe_are_no_object(
+    place: tuple[Float64Array, Int64Array, list[PhotoView]],
+) -> None:
+    """Wrong matches of two photos can lie between the cameras."""
+    points, _, views = place
+    wrong = np.array([0, 0, 0.12]) + np.random.default_rng(1).normal(0, 0.005, (200, 3))
+    more = np.arange(len(points), len(points) + len(wrong), dtype=np.int32)
+    seen = [replace(view, seen=np.append(view.seen, more)) if k < 2 else view for k, view in enumerate(views)]
+    found = choose_object(np.concatenate([points, wrong]), seen)
+    assert ball_of(found.above, place) == {1} and len(found.others) == 2
 
 
 def test_hints_without_a_matching_object_are_refused(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
@@ -82,6 +109,9 @@ def test_hints_without_a_matching_object_are_refused(place: tuple[Float64Array, 
         choose_object(points, views, picks_not=[pick(place, 2)], box=only)
     with pytest.raises(InputError, match="no point of an object within 32 px"):
         choose_object(points, views, picks=[Pick("one.jpg:0,0", views[0], (0.0, 0.0))])
+    blind = replace(views[0], seen=views[0].seen[labels[views[0].seen] != 1])
+    with pytest.raises(InputError, match="no point of an object within 32 px"):
+        choose_object(points, views, picks=[replace(one, view=blind)])
     bare = np.flatnonzero(labels == 0)
     place_of = {int(old): new for new, old in enumerate(bare)}
     fewer = [

@@ -39,6 +39,22 @@ def test_the_hidden_share_of_a_ball_is_the_overlap_of_two_discs(aside: float) ->
     assert hidden_share(CAMERA, own, [before, behind, before]) == pytest.approx(shared, abs=0.05)
 
 
+@pytest.mark.parametrize("axis", [0, 2])
+def test_an_object_before_one_end_hides_this_end(axis: int) -> None:
+    """The outline of two balls of radius r at a distance d has an area of pi r^2 + 2 r d."""
+    ends = [sign * 0.05 * np.eye(3)[axis] for sign in (-1, 1)]
+    own = np.concatenate([ball(tuple(end)) for end in ends])
+    disc = np.pi * 0.04**2
+    before = ball(tuple(ends[1] + (0, -0.2, 0)))
+    assert hidden_share(CAMERA, own, [before]) == pytest.approx(disc / (disc + 0.08 * 0.1), abs=0.05)
+    assert hidden_share(CAMERA, own, [before - (0, 6, 0)]) == 0  # behind the camera
+
+
+def test_an_object_before_the_middle_of_the_other_hides_it() -> None:
+    """It is not in front of the nearest point."""
+    assert hidden_share(CAMERA, ball((0, 0, 0)), [ball((0, -0.02, 0), 0.01)]) == pytest.approx(1 / 16, abs=0.03)
+
+
 def test_a_ring_around_the_object_hides_only_with_its_front() -> None:
     turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     ring = np.column_stack([0.07 * np.cos(turns), 0.07 * np.sin(turns), np.full(400, -0.035)])

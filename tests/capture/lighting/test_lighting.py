@@ -86,6 +86,23 @@ class TestPanoramas:
         mean = np.array(emitter.eval(seen))[0] @ sight
         assert between(mean / np.linalg.norm(mean), directions(32, 64, turn)[7, 50]) < 2.0  # a pixel is 5.6 degrees
 
+    def test_a_rotated_panorama_has_rotated_directions(self) -> None:
+        """Radiance that is linear in the direction, v d, becomes (R v) d."""
+        linear, turn = np.array([0.3, -0.5, 0.8]), Rotation.from_euler("zyx", [100, 25, -40], degrees=True)
+        sky = (2 + directions(128, 256) @ linear)[..., None].repeat(3, axis=2).astype(np.float32)
+        error = np.abs(panorama.rotated(sky, turn.as_matrix())[..., 1] - 2 - directions(128, 256) @ turn.apply(linear))
+        assert error.mean() < 2e-4 and error.max() < 0.02  # half a row is 0.012 rad
+
+    @pytest.mark.parametrize(("azimuth", "elevation"), [(20.0, 30.0), (200.0, -50.0), (359.0, 5.0)])
+    def test_angles_are_those_of_the_direction(self, azimuth: float, elevation: float) -> None:
+        assert panorama.angles(unit_vector(azimuth, elevation)) == pytest.approx((azimuth, elevation))
+
+    def test_negative_radiance_is_read_as_none(self, tmp_path: Path) -> None:
+        sky = np.full((4, 8, 3), 0.25, np.float32)
+        sky[1, 2] = -1.0
+        panorama.write_radiance(tmp_path / "sky.exr", sky)
+        np.testing.assert_array_equal(panorama.read_panorama(tmp_path / "sky.exr"), np.maximum(sky, 0))
+
 
 class TestLamps:
     @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Closing of small holes of meshes, such as missing triangles of scans."""
+"""Closing of small holes of meshes, such as missing triangles of scans, and removal of loose fragments."""
 
 from __future__ import annotations
 
@@ -13,19 +13,25 @@ from mitsplat.arrays import Float64Array, Int64Array
 
 _MAX_SHARE = 0.005
 """Maximum area of a hole, relative to the area of its body. The opening of a box or of a cup is larger."""
+_FRAGMENT = 0.001
+"""Maximum number of faces of a fragment, relative to those of the mesh."""
 _FLAT = 0.999
 """Area of a hole of three edges, relative to that of its body, above which the body is a flat sheet in this outline."""
-_MAX_EDGES = 100
-"""Maximum number of edges of a hole, because the time grows with its third power: 0.1 s for 100 edges."""
+_MAX_EDGES = 400
+"""Maximum number of edges of a hole, because the time grows with its square: 2 s for 400 edges."""
 
 
 def close_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a mesh whose small holes are closed; a closed mesh is returned unchanged.
+    """Return a mesh without fragments, whose small holes are closed; a closed mesh is returned unchanged.
 
     Small holes have three edges, or an area of at most 0.5 % of the connected faces around them. Each gets its
     triangulation of minimum area (Barequet and Sharir, *Filling Gaps in the Boundary of a Polyhedron*, 1995). Larger
     openings stay open, and sheets stay sheets, also beside larger bodies in the same mesh.
+
+    Fragments are open sheets of at most 0.1 % of the faces. They are removed if they have at most 0.5 % of the area
+    together, such as the loose triangles of a scan, which would make it open.
     """
+    mesh = _without_fragments(mesh)
     if mesh.is_watertight:
         return mesh
     body = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
@@ -46,6 +52,23 @@ def close_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if not found:
         return mesh
     return trimesh.Trimesh(mesh.vertices, np.concatenate([mesh.faces, *found]), process=False)
+
+
+def _without_fragments(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a mesh without small open sheets; see :func:`close_holes`."""
+    if mesh.is_watertight or len(mesh.faces) * _FRAGMENT < 1:
+        return mesh
+    body = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    counts, areas = np.bincount(body), np.bincount(body, weights=mesh.area_faces)
+    fragment = counts <= _FRAGMENT * len(mesh.faces)
+    is_open = np.zeros(len(counts), dtype=bool)
+    is_open[body[mesh.edges_face[group_rows(mesh.edges_sorted, require_count=1)]]] = True
+    fragment &= is_open
+    if not fragment.any() or areas[fragment].sum() > _MAX_SHARE * areas.sum():
+        return mesh
+    rest = trimesh.Trimesh(mesh.vertices, mesh.faces[~fragment[body]], process=False)
+    rest.remove_unreferenced_vertices()
+    return rest
 
 
 def _holes(mesh: trimesh.Trimesh, single: Int64Array) -> Iterator[Int64Array]:

@@ -54,6 +54,18 @@ def test_a_hole_that_is_not_convex_is_closed_within_its_outline() -> None:
     assert closed.area == pytest.approx(0.06, rel=1e-9)
 
 
+def test_a_long_hole_is_closed() -> None:
+    """A scratch of 118 triangles in a side of 49,152 / 6 has 120 edges and 0.24 % of the area."""
+    box = fine_box().subdivide()
+    x, y, z = (box.triangles_center / (0.1 / 64)).T  # squares of one unit, two triangles each
+    hole = (z > 31.9) & (np.abs(x) < 29.5) & (y > 0) & (y < 1)
+    scan = without(box, hole)
+    assert len(trimesh.grouping.group_rows(scan.edges_sorted, require_count=1)) > 100
+    closed = close_holes(scan)
+    assert closed.is_volume
+    assert closed.area == pytest.approx(0.06, rel=1e-9)
+
+
 def test_a_lost_triangle_of_a_coarse_mesh_is_restored() -> None:
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     assert close_holes(without(box, [3])).volume == pytest.approx(1e-3)
@@ -104,6 +116,27 @@ def test_small_open_bodies_beside_a_large_one_stay_open(small: str) -> None:
     assert close_holes(both) is both
     lost = trimesh.util.concatenate([without(large, [3]), body])
     assert close_holes(lost).area == pytest.approx(both.area)
+
+
+def test_fragments_of_a_scan_are_removed() -> None:
+    """A loose triangle beside the box, and one in the middle of a hole, would make the box open."""
+    box = fine_box()
+    middle = int(np.linalg.norm(box.triangles_center - (0.001, 0.001, 0.05), axis=1).argmin())
+    around = np.isin(box.faces, box.faces[middle]).any(axis=1)
+    around[middle] = False
+    loose = trimesh.Trimesh([(0.1, 0, 0), (0.101, 0, 0), (0.1, 0.001, 0)], [(0, 1, 2)])
+    closed = close_holes(trimesh.util.concatenate([without(box, around), loose]))
+    assert closed.is_volume
+    assert closed.volume == pytest.approx(1e-3, rel=1e-9)
+    assert closed.vertices[:, 0].max() < 0.06
+
+
+def test_many_small_sheets_are_no_fragments() -> None:
+    """The leaves of a plant: 0.02 % of the faces each, but a tenth of the area."""
+    leaf = trimesh.Trimesh([(0, 0, 0), (0.02, 0, 0), (0, 0.02, 0)], [(0, 1, 2)])
+    leaves = [leaf.copy().apply_translation((0.1, 0, 0.005 * number)) for number in range(30)]
+    plant = trimesh.util.concatenate([fine_box(), *leaves])
+    assert close_holes(plant) is plant
 
 
 def test_a_closed_mesh_is_returned_unchanged() -> None:

@@ -33,9 +33,9 @@ from mitsplat.arrays import Float32Array, Float64Array, Int64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.material_files import write_materials
 from mitsplat.gaussians.splat_cloud import Splats
-from mitsplat.geometry.mesh import is_closed
 from mitsplat.geometry.mesh_normals import state_normals, stated_normals
 from mitsplat.geometry.rigid import homogeneous_matrix, scaling, transform_points
+from mitsplat.geometry.solids import is_closed
 from mitsplat.mesh_files.mesh_reading import read_mesh, read_proxy
 from mitsplat.storage.field_types import Name, Positive
 from mitsplat.storage.file_kinds import no_folder_with

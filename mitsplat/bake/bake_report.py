@@ -11,8 +11,9 @@ from mitsplat.bake.bake import BakeResult
 from mitsplat.bake.size_checks import describe_size
 from mitsplat.bake.verification import BakedView
 from mitsplat.geometry.decomposition import max_gap
-from mitsplat.geometry.mesh import is_closed, mass_properties
+from mitsplat.geometry.mesh import mass_properties
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
+from mitsplat.geometry.solids import is_closed
 from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report_page
 
 _VIEW = 420

@@ -10,13 +10,14 @@ import shapely
 import trimesh
 
 from mitsplat.bake.mesh_parts import MeshPart
-from mitsplat.geometry.mesh import is_closed, join_meshes, separate_solids, simplify_solid
 from mitsplat.geometry.mesh_holes import close_holes
-from mitsplat.geometry.mesh_points import points_inside
+from mitsplat.geometry.solids import is_closed, join_meshes, signed_volume, simplify_solid, turn_outwards, unite_bodies
 from mitsplat.renderer.occluders.proxies import Occluder, Proxies
 
 _LABEL_GAP = 0.01
 """Maximum distance of a label sheet from its solid, relative to the size of the sheet."""
+_FLAT = 1e-9
+"""Volume relative to the cube of the size below which both sides of a sheet enclose nothing."""
 _TOUCHING = 1e-6
 """Tolerance of the simplification of the union of touching solids, relative to its size."""
 _TOLERANCES = 1e-5 * 1.5 ** np.arange(18)
@@ -29,12 +30,14 @@ def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
     Open sheets are not decimated, because decimation would shrink them from their edges. Flat sheets are
     re-triangulated from their outlines.
     """
-    meshes = [_close_solid(part.mesh) for part in parts]
-    solids = [body for mesh in meshes if mesh.is_volume for body in _bodies(mesh)]
-    sheets = [mesh for mesh in meshes if not mesh.is_volume]
-    if len(solids) > 1:
-        solids = [_unite(solids)]
+    solids: list[trimesh.Trimesh] = []
+    sheets: list[trimesh.Trimesh] = []
+    for part in parts:
+        mesh = _close_solid(part.mesh)
+        is_solid = is_closed(mesh) and signed_volume(mesh) > _FLAT * mesh.scale**3
+        (solids if is_solid else sheets).append(mesh)
     if solids:
+        solids = [_unite(solids)]
         sheets = [sheet for sheet in sheets if not _lies_on(sheet, solids[0])]
     sheets = [_retriangulate_flat(sheet) for sheet in sheets]
     face_budget = max(most_faces - sum(len(sheet.faces) for sheet in sheets), most_faces // 2)
@@ -42,36 +45,16 @@ def make_proxy(parts: Sequence[MeshPart], most_faces: int) -> trimesh.Trimesh:
     return _merged(trimesh.util.concatenate(solids + sheets))
 
 
-def _bodies(solid: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """Return the bodies of a solid, each with the cavities inside it.
-
-    A cavity belongs to the smallest body around it. A solid is returned unchanged if its bodies are apart, or if one of
-    its surfaces is inside out and in no body.
-    """
-    surfaces = sorted(separate_solids(solid), key=lambda surface: float(surface.volume))
-    bodies = {number: [surface] for number, surface in enumerate(surfaces) if surface.volume > 0}
-    low, high = np.moveaxis(np.array([surfaces[number].bounds for number in bodies]), 1, 0)
-    meets = ((low[:, None] < high) & (low < high[:, None])).all(axis=2)
-    if np.count_nonzero(meets) == len(bodies):  # each body meets only itself
-        return [solid]
-    for cavity in surfaces[: len(surfaces) - len(bodies)]:
-        around = (number for number in bodies if points_inside(surfaces[number], cavity.vertices[:1]).all())
-        if (smallest := next(around, None)) is None:
-            return [solid]
-        bodies[smallest].append(cavity)
-    return [join_meshes(body) for body in bodies.values()]
-
-
 def _unite(solids: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Unite solids.
+    """Return solids as one mesh in which bodies are not inside out, and are united if they touch or overlap.
 
     Where solids touch, their union has vertices closer to each other than vertices of files are, which are merged. Four
     faces can then share an edge. The union is simplified in this case, which leaves no such vertices.
     """
-    union = trimesh.boolean.union(solids, engine="manifold")
+    union = unite_bodies(turn_outwards(join_meshes(solids))[0])
     if _merged(union).is_volume:
         return union
-    simple = simplify_solid(union, tolerance=_TOUCHING * union.scale)
+    simple = simplify_solid(union, _TOUCHING * union.scale)
     return simple if _merged(simple).is_volume else union
 
 
@@ -91,11 +74,9 @@ def _simplify(solid: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
     fewer = _without_folds(solid.simplify_quadric_decimation(face_count=most))
     if fewer.is_volume and len(fewer.faces) <= most:
         return fewer
-    fewest = solid
-    for tolerance in _TOLERANCES * solid.scale:
-        fewest = min(fewest, simplify_solid(solid, tolerance), key=lambda mesh: len(mesh.faces))
-        if len(fewest.faces) <= most:
-            return fewest
+    fewest = simplify_solid(solid, *_TOLERANCES * solid.scale, most=most)
+    if len(fewest.faces) <= most:
+        return fewest
     return fewer if is_closed(fewer) and len(fewer.faces) < len(fewest.faces) else fewest
 
 
@@ -109,7 +90,7 @@ def _without_folds(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def _close_solid(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Close small holes of a solid, such as missing triangles of a scan; return any other mesh unchanged."""
     closed = close_holes(mesh)
-    return closed if closed.is_volume else mesh
+    return closed if is_closed(closed) else mesh
 
 
 def _retriangulate_flat(sheet: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -24,7 +24,8 @@ from mitsplat.errors import InputError
 from mitsplat.findings import Finding
 from mitsplat.formats.registry import Catalogue
 from mitsplat.geometry.coplanar import coplanar_place
-from mitsplat.geometry.mesh import closed_solid, is_closed, mass_properties
+from mitsplat.geometry.mesh import closed_solid
+from mitsplat.geometry.solids import is_closed
 from mitsplat.physics.settle import try_alone, warp_settings
 from mitsplat.reconstruct.registration import measure_offset
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
@@ -238,16 +239,15 @@ def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
     """Check the density that follows from the mass of an object and the volume of its mesh."""
     try:
         pieces = asset.pieces or (mesh.convex_hull,)
-        solid = closed_solid(mesh, pieces)
-        volume = abs(float(np.linalg.det(solid.triangles).sum())) / 6
+        volume = abs(float(np.linalg.det(closed_solid(mesh, pieces).triangles).sum())) / 6
     except QhullError:
         volume = 0.0
     if not 0 < volume < np.inf:
         yield Finding("mass", False, "its mesh spans no volume", "give it another mesh, or another size")
         return
-    mass = mass_properties(mesh, pieces, density=asset.density, mass=asset.mass).mass
+    mass = asset.density * volume if asset.mass is None else asset.mass
     density = mass / volume
-    has_solid = solid is mesh or bool(asset.pieces)
+    has_solid = is_closed(mesh) or bool(asset.pieces)
     hull = "" if has_solid else " if it fills its convex hull; its convex pieces are not computed yet"
     yield Finding(
         "mass", DENSITY_LIMITS[0] <= density <= DENSITY_LIMITS[1], f"{mass:.3g} kg, of {density:.0f} kg/m^3{hull}",

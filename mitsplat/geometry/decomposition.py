@@ -20,9 +20,10 @@ from scipy.spatial import ConvexHull
 
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.hull_fit import fit_to_hull
-from mitsplat.geometry.mesh import SHARP, contact_points, is_closed, separate_solids, simplify_solid
+from mitsplat.geometry.mesh import SHARP, contact_points
 from mitsplat.geometry.mesh_distance import DistanceSurface, max_outside_distance
 from mitsplat.geometry.mesh_holes import close_holes
+from mitsplat.geometry.solids import is_closed, separate_solids, simplify_solid
 from mitsplat.storage.cache import cache_folder, write_cache_file
 from mitsplat.storage.content_hash import ContentHash
 
@@ -92,7 +93,7 @@ def convex_pieces(
 @lru_cache(maxsize=256)
 def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, max_pieces: int) -> tuple[trimesh.Trimesh, ...]:
     libraries = f"{version('coacd')} {version('manifold3d')}"  # of meshes with few faces, and of scans
-    digest = ContentHash("pieces 10", f"{libraries} {threshold!r} {max_pieces}", vertices, faces)
+    digest = ContentHash("pieces 11", f"{libraries} {threshold!r} {max_pieces}", vertices, faces)
     path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:

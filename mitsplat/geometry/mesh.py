@@ -1,20 +1,18 @@
-"""Proxy meshes for physics: validation, mass and inertia."""
+"""Proxy meshes for physics: validation, mass, inertia and contact points."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
-import manifold3d
 import numpy as np
 import trimesh
 
 from mitsplat.arrays import Float64Array
 from mitsplat.errors import InputError
 from mitsplat.geometry.mesh_holes import close_holes
-from mitsplat.geometry.mesh_points import points_inside
+from mitsplat.geometry.solids import is_closed, join_meshes, turn_outwards, unite_bodies
 
 _logger = logging.getLogger(__name__)
 
@@ -22,8 +20,6 @@ _logger = logging.getLogger(__name__)
 _MIN_SIZE, _MAX_SIZE = 5e-4, 20.0
 # More triangles do not change how an object rests, and CoACD takes hours for them.
 _MAX_FACES = 200_000
-# Share of the volume below which a surface is debris of a scan, whose direction does not matter.
-_MIN_SHARE = 1e-6
 # Minimum angle between faces at an edge that can penetrate another object [rad].
 SHARP = 0.17
 
@@ -87,50 +83,31 @@ def prepare_mesh(mesh: trimesh.Trimesh, name: str, *, solid: bool = True) -> tri
     welded.remove_unreferenced_vertices()
     if solid:
         welded = close_holes(welded)  # where slivers were removed
+    closed = is_closed(welded)
+    turned, surfaces = 0, 1
+    if solid and closed:
+        welded, turned, surfaces = turn_outwards(welded)
     # Divergence theorem: sum of the tetrahedra from the centre to each triangle. Holes matter least from there.
     volume = float(np.linalg.det(welded.triangles - mesh.bounds.mean(axis=0)).sum()) / 6
-    if volume < 0 and (solid or is_closed(welded)):  # an open scan has no inside
-        _logger.warning("%s: the mesh is inside out; physics flips its faces", name)
+    if volume < 0 and (solid or closed):  # an open scan has no inside
         welded.invert()
-    if solid and welded.is_watertight and welded.is_winding_consistent:
-        welded = _with_outward_bodies(welded, name)
-        volume = float(welded.volume)
+        turned = surfaces
+    if turned == surfaces:
+        _logger.warning("%s: the mesh is inside out; physics flips its faces", name)
+    elif turned:
+        text = "%s: bodies of the mesh are inside out; physics flips their faces (%d of %d surfaces)"
+        _logger.warning(text, name, turned, surfaces)
     if solid and abs(volume) < 1e-6 * size**3:
         raise InputError(
             f"{name}: the mesh must enclose a volume (got {abs(volume):.3g} m^3 at {size:g} m across): "
             "is it open or flat?"
         )
-    if solid and not is_closed(welded):
+    if solid and not closed:
         _logger.warning("%s: the mesh is not closed; mass and inertia are those of its convex pieces", name)
     if len(welded.faces) > _MAX_FACES:
         _logger.warning("%s: physics simplifies the mesh of %d to %d triangles", name, len(welded.faces), _MAX_FACES)
         welded = welded.simplify_quadric_decimation(face_count=_MAX_FACES)
     return welded
-
-
-def _with_outward_bodies(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
-    """Return a closed mesh whose bodies beside others are not inside out; their volumes would be subtracted.
-
-    Surfaces of negative volume inside another surface are cavities, and stay.
-    """
-    surface = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
-    volumes = np.bincount(surface, weights=np.linalg.det(mesh.triangles - mesh.bounds.mean(axis=0)))
-    faces, flipped = mesh.faces.copy(), 0
-    for number in np.flatnonzero(volumes < -_MIN_SHARE * np.abs(volumes).sum()):
-        own = surface == number
-        rest = trimesh.Trimesh(mesh.vertices, mesh.faces[~own], process=False)
-        if not points_inside(rest, mesh.triangles[own][0, :1]).all():
-            faces[own] = faces[own, ::-1]
-            flipped += 1
-    if not flipped:
-        return mesh
-    _logger.warning(
-        "%s: bodies of the mesh are inside out; physics flips their faces (%d of %d surfaces)",
-        name,
-        flipped,
-        len(volumes),
-    )
-    return trimesh.Trimesh(mesh.vertices, faces, process=False)
 
 
 def mass_properties(
@@ -154,42 +131,8 @@ def mass_properties(
 
 
 def closed_solid(mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Return the mesh if it is closed, else its joined convex pieces."""
-    return mesh if is_closed(mesh) else join_meshes(pieces)
-
-
-def is_closed(mesh: trimesh.Trimesh) -> bool:
-    """Return True if the faces enclose solids: they pass each edge equally often in both directions.
-
-    Four faces share an edge where solids touch, or where a coarse solid touches itself. ``is_watertight`` of trimesh
-    is then False, although the volume is defined. Faces that are listed twice would count their solid twice, and both
-    sides of a sheet without thickness enclose nothing: such meshes are not closed. Nor are those with both sides of a
-    whole solid, whose volumes cancel. The faces at which two solids touch end at other faces.
-    """
-    if mesh.is_watertight:
-        return bool(mesh.is_winding_consistent)
-    directions = np.where(mesh.edges[:, 0] < mesh.edges[:, 1], 1, -1)
-    edges, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
-    if np.bincount(edge.ravel(), directions, len(edges)).any():
-        return False
-    corners = np.sort(mesh.faces, axis=1)
-    turns = np.sign(np.linalg.det(np.eye(3)[np.argsort(mesh.faces, axis=1)]))  # the direction of equal corners
-    if len(np.unique(np.column_stack([corners, turns]), axis=0)) < len(corners):
-        return False
-    one, other = mesh.face_adjacency.T  # the faces of edges that two faces share
-    if (corners[one] == corners[other]).all(axis=1).any():
-        return False
-    _, twin, counts = np.unique(corners, axis=0, return_inverse=True, return_counts=True)
-    sides = edge.reshape(-1, 3)[counts[twin.ravel()] == 2]  # edges of faces that are listed in both directions
-    links = np.concatenate([sides[:, :2], sides[:, 1:]])
-    patch = trimesh.graph.connected_component_labels(links, node_count=len(edges))
-    at_end = np.bincount(sides.ravel(), minlength=len(edges)) == 2
-    return bool(np.isin(patch[sides[:, 0]], patch[at_end]).all())
-
-
-def join_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Return all triangles as one mesh."""
-    return cast(trimesh.Trimesh, trimesh.util.concatenate(list(meshes)))
+    """Return the solid of a closed mesh, without overlaps and bodies that are inside out, else the convex pieces."""
+    return unite_bodies(turn_outwards(mesh)[0]) if is_closed(mesh) else join_meshes(pieces)
 
 
 def contact_points(mesh: trimesh.Trimesh) -> Float64Array:
@@ -206,31 +149,6 @@ def contact_points(mesh: trimesh.Trimesh) -> Float64Array:
     share = (step / parts[edge])[:, None]
     between = (1 - share) * ends[edge, 0] + share * ends[edge, 1]
     return np.concatenate([mesh.vertices, between])
-
-
-def solid_manifold(solid: trimesh.Trimesh) -> manifold3d.Manifold:
-    """Return a closed surface as a solid of Manifold, in single precision."""
-    # Manifold refuses subclasses of NumPy arrays whose rows are not contiguous. Reordered faces are such arrays.
-    vertices = np.ascontiguousarray(solid.vertices, np.float32)
-    return manifold3d.Manifold(manifold3d.Mesh(vertices, np.ascontiguousarray(solid.faces, np.uint32)))
-
-
-def separate_solids(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """Return the connected surfaces of a closed mesh, each of which has two faces at every edge.
-
-    Surfaces of negative volume are cavities.
-    """
-    if mesh.is_watertight:
-        return list(mesh.split(only_watertight=False))
-    surfaces = [solid.to_mesh() for solid in solid_manifold(mesh).decompose()]
-    return [trimesh.Trimesh(found.vert_properties[:, :3], found.tri_verts, process=False) for found in surfaces]
-
-
-def simplify_solid(solid: trimesh.Trimesh, tolerance: float) -> trimesh.Trimesh:
-    """Return a closed surface with fewer faces, within about ``tolerance`` [m] of the original (by Manifold)."""
-    mesh = solid_manifold(solid).simplify(tolerance).to_mesh()
-    simple = trimesh.Trimesh(mesh.vert_properties[:, :3].astype(np.float64), mesh.tri_verts, process=False)
-    return simple if simple.is_volume else solid
 
 
 def check_faces(mesh: trimesh.Trimesh, source: object) -> None:

@@ -15,8 +15,9 @@ import trimesh
 import warp as wp
 
 from mitsplat.arrays import Float32Array, Float64Array, Int64Array
-from mitsplat.geometry.mesh import contact_points, join_meshes
+from mitsplat.geometry.mesh import contact_points
 from mitsplat.geometry.rigid import transform_points
+from mitsplat.geometry.solids import join_meshes
 from mitsplat.runtime.warp_start import quiet_warp
 
 _SAMPLES, _BATCH = 4000, 256

@@ -16,8 +16,9 @@ from mitsplat.asset import Asset
 from mitsplat.errors import InputError
 from mitsplat.geometry.decomposition import MAX_PIECES, convex_pieces, max_gap
 from mitsplat.geometry.hull_facets import contact_pieces
-from mitsplat.geometry.mesh import MassProperties, join_meshes, mass_properties, prepare_mesh
+from mitsplat.geometry.mesh import MassProperties, mass_properties, prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
+from mitsplat.geometry.solids import join_meshes
 from mitsplat.physics.contacts import newton_hull
 from mitsplat.physics.friction import ContactMaterial
 from mitsplat.progress import Note

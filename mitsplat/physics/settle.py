@@ -42,6 +42,7 @@ MODULES = (
     "geometry.mesh_holes",
     "geometry.mesh_points",
     "geometry.rigid",
+    "geometry.solids",
     *(f"physics.{name}" for name in _PHYSICS_MODULES),
     "scene.planning.contents",
     "scene.planning.shape_poses",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from mitsplat.geometry.mesh import join_meshes, solid_manifold
+from mitsplat.geometry.solids import join_meshes, solid_manifold
 
 _SEPARATION = 0.02
 """Share of the way to its neighbours by which a vertex is moved away from a coincident one."""

@@ -8,8 +8,8 @@ import trimesh
 
 from mitsplat.bake.mesh_parts import MeshPart
 from mitsplat.bake.proxy_mesh import make_proxy
-from mitsplat.geometry.mesh import is_closed
 from mitsplat.geometry.mesh_distance import DistanceSurface
+from mitsplat.geometry.solids import is_closed
 
 
 def part(mesh: trimesh.Trimesh) -> MeshPart:
@@ -85,6 +85,8 @@ BLOCK = (0.05, 0.04, 0.03)
         ([box(BLOCK), box(BLOCK, (0.02, 0.01, 0.01))], 2 * 60e-6 - 18e-6),
         ([box(BLOCK), box(BLOCK, (0.06, 0.0, 0.0))], 2 * 60e-6),
         ([box(BLOCK), cavity((0.03, 0.02, 0.01))], 60e-6 - 6e-6),
+        # The second block is inside out.
+        ([box(BLOCK), cavity((0.04, 0.03, 0.02), (0.06, 0, 0))], 60e-6 + 24e-6),
         # A ball of a rattle inside a cavity.
         ([box(BLOCK), cavity((0.03, 0.02, 0.01)), box((0.01, 0.01, 0.005))], 60e-6 - 6e-6 + 0.5e-6),
         # The second block is 10 mm high and covers the cavity of the first one at x > 10 mm: a third of it.

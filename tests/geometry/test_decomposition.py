@@ -11,8 +11,8 @@ import trimesh
 from mitsplat.asset import Asset
 from mitsplat.geometry import decomposition
 from mitsplat.geometry.decomposition import convex_pieces, denoise_solid, max_gap
-from mitsplat.geometry.mesh import simplify_solid
 from mitsplat.geometry.mesh_distance import DistanceSurface, standoff
+from mitsplat.geometry.solids import simplify_solid
 
 PARTS = Path(__file__).parents[2] / "scenes/assets"
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from mitsplat.errors import InputError
-from mitsplat.geometry.mesh import contact_points, is_closed, mass_properties, prepare_mesh
+from mitsplat.geometry.mesh import contact_points, mass_properties, prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface
 
 
@@ -129,73 +129,3 @@ def test_contact_points_are_dense_along_edges():
     assert (at_edge >= 2).all()
     along = np.sort(points[np.linalg.norm(points[:, :2] - 0.01, axis=1) < 1e-9, 2])
     np.testing.assert_allclose(np.diff(along), 0.0005)
-
-
-def _touching(case: str) -> trimesh.Trimesh:
-    """Closed solids of one mesh whose equal vertices are merged, so that four faces share an edge."""
-    box = trimesh.creation.box((0.05, 0.04, 0.03))
-    other = box.copy()
-    match case:
-        case "edge":
-            other.apply_translation((0.05, 0.04, 0))
-        case "face":
-            other.apply_translation((0, 0, 0.03))
-        case "lid":  # a ring and a disc on it, with other triangles on the faces where they touch
-            box = trimesh.creation.annulus(0.018, 0.02, 0.008)
-            other = trimesh.creation.cylinder(0.02, 0.0015, sections=32)
-            other.apply_translation((0, 0, 0.00475))
-    return trimesh.Trimesh(*trimesh.util.append_faces([box.vertices, other.vertices], [box.faces, other.faces]))
-
-
-@pytest.mark.parametrize("case", ["edge", "face", "lid"])
-def test_solids_that_touch_are_closed(case: str, caplog: pytest.LogCaptureFixture) -> None:
-    mesh = _touching(case)
-    assert not mesh.is_watertight
-    assert is_closed(mesh)
-    prepared = prepare_mesh(mesh, case)
-    assert not caplog.records
-    found = mass_properties(prepared, (), density=1000.0)
-    assert found.mass == pytest.approx(1000.0 * mesh.volume)
-    np.testing.assert_allclose(found.centre, mesh.center_mass, atol=1e-9)
-
-
-def test_faces_listed_twice_turned_or_without_thickness_are_not_closed() -> None:
-    box = trimesh.creation.box((0.05, 0.04, 0.03))
-    assert is_closed(box)
-    twice = trimesh.Trimesh(box.vertices, np.concatenate([box.faces, np.roll(box.faces, 1, axis=1)]), process=False)
-    turned = trimesh.Trimesh(box.vertices, np.concatenate([box.faces[:6], box.faces[6:, ::-1]]), process=False)
-    corners = np.concatenate([box.vertices, [[0.1, 0, 0]]])
-    first, second = box.edges_unique[0]
-    fin = np.array([[first, second, 8], [second, first, 8]])  # both sides of a sheet on an edge of the box
-    finned = trimesh.Trimesh(corners, np.concatenate([box.faces, fin]), process=False)
-    for mesh in (twice, turned, finned):
-        assert not is_closed(mesh)
-
-
-@pytest.mark.parametrize("place", [(0.2, 0, 0), (0.05, 0.04, 0)], ids=["apart", "touching"])
-def test_a_solid_whose_faces_are_also_listed_turned_is_not_closed(place: tuple[float, float, float]) -> None:
-    """Its two volumes cancel each other, so that the mass would be that of the other solid alone."""
-    box = trimesh.creation.box((0.05, 0.04, 0.03))
-    both_sides = np.concatenate([box.faces, box.faces[:, ::-1]])
-    other = box.copy().apply_translation(place)
-    joint = trimesh.Trimesh(*trimesh.util.append_faces([box.vertices, other.vertices], [both_sides, other.faces]))
-    assert not is_closed(joint)
-
-
-def test_a_body_inside_out_beside_another_is_flipped_and_a_cavity_is_not(caplog: pytest.LogCaptureFixture) -> None:
-    body, beside = trimesh.creation.box((0.05, 0.04, 0.03)), trimesh.creation.box((0.02, 0.02, 0.02))
-    cavity = trimesh.creation.box((0.01, 0.01, 0.01))
-    beside.apply_translation((0.2, 0, 0))
-    expected = body.volume + beside.volume - cavity.volume
-    beside.invert()
-    cavity.invert()
-    joint = trimesh.util.concatenate([body, beside, cavity])
-    assert prepare_mesh(joint, "part").volume == pytest.approx(expected)
-    assert caplog.messages == ["part: bodies of the mesh are inside out; physics flips their faces (1 of 3 surfaces)"]
-
-
-def test_a_body_and_its_equal_inside_out_have_a_volume() -> None:
-    body = trimesh.creation.box((0.05, 0.04, 0.03))
-    other = body.copy().apply_translation((0.2, 0, 0))
-    other.invert()
-    assert prepare_mesh(trimesh.util.concatenate([body, other]), "part").volume == pytest.approx(2 * body.volume)

@@ -33,7 +33,7 @@ from mitsplat.importing.import_result import Imported, ImportSupport
 from mitsplat.importing.standing import cut_base, topples
 from mitsplat.importing.upright import Plane, Upright, cut_support, find_up
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.asset_evaluation import is_closed, show_asset
+from mitsplat.reconstruct.asset_evaluation import is_closed_when_read, show_asset
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
 from mitsplat.renderer.layers import render_splats
@@ -174,7 +174,7 @@ def import_splats(
         removed=cleaner.removed,
         removed_splats=cleaner.removed_splats().transformed(asset_from_file),
         support=support,
-        watertight=asset.mesh is not None and is_closed(asset.mesh),
+        watertight=asset.mesh is not None and is_closed_when_read(asset.mesh),
         topples=kind == "object" and asset.mesh is not None and topples(asset.mesh),
     )
     if asset.mesh is None:

@@ -17,6 +17,7 @@ from mitsplat.fit.image_metrics import psnr_of
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.gaussians.splat_training import trained_kernel
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.solids import is_closed
 from mitsplat.images.colour import encode_srgb
 from mitsplat.images.masks import iou
 from mitsplat.quality import resolve_quality
@@ -269,17 +270,17 @@ def compute_verdict(
         units=capture.units,
         gaussians=len(splats),
         faces=0 if mesh is None else len(mesh.faces),
-        watertight=mesh is not None and is_closed(mesh),
+        watertight=mesh is not None and is_closed_when_read(mesh),
         solid=isolation is not None,
         causes=causes or {},
     )
 
 
-def is_closed(mesh: trimesh.Trimesh) -> bool:
-    """Return True if a mesh is watertight, also after coincident vertices are welded."""
+def is_closed_when_read(mesh: trimesh.Trimesh) -> bool:
+    """Return True if a mesh is closed after vertices at the same position are merged, as readers of its file do."""
     welded = mesh.copy()
     welded.merge_vertices(merge_tex=True, merge_norm=True)
-    return bool(welded.is_watertight)
+    return is_closed(welded)
 
 
 def take_evenly(items: Sequence[T], count: int) -> list[T]:

@@ -20,7 +20,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.images.masks import iou
 from mitsplat.progress import Progress
-from mitsplat.reconstruct.asset_evaluation import is_closed, show_asset, take_evenly
+from mitsplat.reconstruct.asset_evaluation import is_closed_when_read, show_asset, take_evenly
 from mitsplat.reconstruct.registration import measure_offset, surface_points
 from mitsplat.reconstruct.segment_splats import MaskedView
 from mitsplat.reconstruct.surface import SurfaceSettings, reconstruct_surface
@@ -106,7 +106,7 @@ def find_proxy_surface(
 
 def _check_surface(mesh: trimesh.Trimesh, splats: Splats, views: Sequence[MaskedView]) -> tuple[float, str | None]:
     """Return the mean IoU of a mesh's silhouettes with masks, and the reason for a rejection or None."""
-    if not (is_closed(mesh) and mesh.volume > 0):
+    if not (is_closed_when_read(mesh) and mesh.volume > 0):
         return 0.0, "is open"
     shown = show_asset(splats, mesh, [view.camera for view in views])
     overlap = float(

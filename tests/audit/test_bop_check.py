@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mitsplat.audit.bop_check import BopCheck
+from mitsplat.audit.bop_check import BopCheck, _box_iou
 from mitsplat.audit.dataset_check import Violation
 from mitsplat.audit.decoded_frame import DecodedFrame
 from mitsplat.dataset.write import write_dataset
@@ -148,3 +148,11 @@ def test_entries_after_the_last_frame_of_each_scene_are_violations(dataset: Path
     for file in files:
         edit(file, lambda content: content.update({"9": next(iter(content.values()))}))
     assert [where for where, _ in violations_of(dataset)] == [str(file.relative_to(dataset)) for file in files]
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"),
+    [((5, 5, 15, 15), 25 / 175), ((12, 12, 14, 14), 0), ((12, 0, 14, 10), 0), ((0, 0, 10, 10), 1)],
+)
+def test_the_iou_of_boxes_is_that_of_their_areas(other: tuple[int, ...], expected: float) -> None:
+    assert _box_iou(np.array([0, 0, 10, 10]), np.array(other)) == pytest.approx(expected)

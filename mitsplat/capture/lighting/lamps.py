@@ -101,7 +101,7 @@ def take_lamps(panorama: Float32Array, *, rotate_z: float, most: int) -> tuple[l
     height, width = panorama.shape[:2]
     shape = (min(height, _SEARCH_WIDTH // 2), min(width, _SEARCH_WIDTH))
     coarse = resized(panorama, *shape)
-    sight = directions(*shape, rotate_z)
+    sight = directions(*shape)  # only distances between pixels count
     bright = _lamp_pixels(coarse)
     groups = cluster_points(sight[bright], 2 * np.sin(np.radians(_GAP) / 2))
     everywhere, weights = directions(height, width, rotate_z), level_weights(height, width)

@@ -175,10 +175,10 @@ def test_classes_of_several_coco_files_are_matched_by_name(tmp_path: Path) -> No
 
 
 def test_boxes_alone_count_once_each(tmp_path: Path) -> None:
-    boxes = [[40, 30, 20, 10], [10, 30, 20, 10], [40, 30, 20, 10], [5, 5, 1, 1]]
+    boxes = [[40, 30, 20, 10], [10, 30, 20, 10], [40, 30, 20, 10], [0, 0, 1, 1]]
     annotations = [{"id": i, "image_id": 1, "category_id": 1, "bbox": box} for i, box in enumerate(boxes)]
     (sample,) = read_set(coco(tmp_path / "four", {}, annotations=annotations), "train").samples
-    assert [one.box for one in sample.instances] == [(40, 30, 60, 40), (10, 30, 30, 40), (5, 5, 6, 6)]
+    assert [one.box for one in sample.instances] == [(40, 30, 60, 40), (10, 30, 30, 40), (0, 0, 1, 1)]
     (fewer,) = read_set(coco(tmp_path / "three", {}, annotations=annotations[:3]), "train").samples
     assert sample.digest != fewer.digest
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mitsplat.capture.boards.board_mask import bare_squares
 from mitsplat.geometry.camera import Camera
@@ -41,6 +44,26 @@ def test_all_squares_of_a_bare_board_are_found_in_even_and_dim_light(photo: tupl
     dim = np.random.default_rng(0).normal(20 + 0.6 * x * grey, 3).clip(0, 255).astype(np.uint8)
     for image in (grey, dim):
         assert len(squares_of(bare_squares(BOARD, np.eye(4), camera, image), camera)) == ALL
+
+
+def test_the_pose_of_the_board_and_of_the_camera_have_one_world(photo: tuple[Camera, np.ndarray]) -> None:
+    camera, grey = photo
+    moved = np.eye(4)
+    moved[:3, :3] = Rotation.from_euler("zyx", [50, -20, 100], degrees=True).as_matrix()
+    moved[:3, 3] = 0.3, -0.2, 0.5
+    other = replace(camera, world_from_camera=moved @ camera.world_from_camera)
+    found = bare_squares(BOARD, np.eye(4), camera, grey)
+    assert found.any() and (bare_squares(BOARD, moved, other, grey) != found).sum() < 10
+
+
+def test_bare_squares_cover_the_image_of_the_board(photo: tuple[Camera, np.ndarray]) -> None:
+    camera, grey = photo
+    half = 0.5 * BOARD.square * np.array([BOARD.columns, BOARD.rows, 0])
+    corners, _ = camera.project(half * [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    moments = cv2.moments(corners.astype(np.float32))
+    middle = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
+    found = np.argwhere(bare_squares(BOARD, np.eye(4), camera, grey))[:, ::-1]
+    np.testing.assert_allclose(found.mean(axis=0) + 0.5, middle, atol=0.2)
 
 
 @pytest.mark.parametrize("grey_of_it", [5, 50, 120, 180, 250])

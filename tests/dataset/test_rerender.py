@@ -16,7 +16,7 @@ from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.scene import Scene
 from tests.conftest import BOTH, WriteScene, small_scene
 from tests.drawn import large_boxes, render_boxes, scatter_boxes
-from tests.manifests import records_of
+from tests.manifests import records_of, store_lines
 
 DRAWN: dict[str, Any] = {"render": render_boxes, "settle": scatter_boxes}
 
@@ -112,14 +112,24 @@ def test_a_folder_with_other_files_is_refused(scene: Scene, made: Path) -> None:
         rerender_frame(scene, 4, made, **DRAWN)
 
 
-def test_files_outside_of_the_folder_of_a_frame_are_not_removed(scene: Scene, tmp_path: Path) -> None:
+def test_the_last_line_of_the_frame_is_compared(scene: Scene, made: Path, tmp_path: Path) -> None:
+    first, one, two = records_of(made)
+    earlier = {**one, "files": dict.fromkeys(one["files"], "0" * 64)}
+    store_lines(made, [first, earlier, one, {**earlier, "index": 10}, two])
+    assert rerender_frame(scene, 1, tmp_path / "again", dataset=made, **DRAWN).differing == ()
+
+
+def test_files_of_others_are_not_removed(scene: Scene, tmp_path: Path) -> None:
     again = tmp_path / "again"
     again.mkdir()
+    (again / "notes.txt").touch()
     other = tmp_path / ".splats.ply.1.part"
     other.touch()
-    (again / "frame.json").write_text(json.dumps({"files": {f"../{other.name}": "", str(other): ""}}))
+    (again / "frame.json").write_text(
+        json.dumps({"files": dict.fromkeys([f"../{other.name}", str(other), "notes.txt"], "")})
+    )
     rerender_frame(scene, 1, again, **DRAWN)
-    assert other.exists()
+    assert other.exists() and (again / "notes.txt").exists()
 
 
 def test_remaking_a_frame_does_not_change_the_dataset(scene: Scene, made: Path, tmp_path: Path) -> None:

@@ -91,7 +91,8 @@ class TestPanoramas:
         linear, turn = np.array([0.3, -0.5, 0.8]), Rotation.from_euler("zyx", [100, 25, -40], degrees=True)
         sky = (2 + directions(128, 256) @ linear)[..., None].repeat(3, axis=2).astype(np.float32)
         error = np.abs(panorama.rotated(sky, turn.as_matrix())[..., 1] - 2 - directions(128, 256) @ turn.apply(linear))
-        assert error.mean() < 2e-4 and error.max() < 0.02  # half a row is 0.012 rad
+        inner = np.abs((directions(128, 256) @ turn.as_matrix())[..., 2]) < 0.98  # without the poles
+        assert inner.mean() > 0.95 and error[inner].max() < 1e-3  # half a row is 0.012 rad
 
     @pytest.mark.parametrize(("azimuth", "elevation"), [(20.0, 30.0), (200.0, -50.0), (359.0, 5.0)])
     def test_angles_are_those_of_the_direction(self, azimuth: float, elevation: float) -> None:

@@ -77,6 +77,10 @@ def undisturbed(scene, tmp_path):
 
 
 class TestContent:
+    def test_a_seed_may_have_any_number_of_bits(self, scene, tmp_path):
+        out = write(load_scene(scene.path, overrides={"seed": 2**70}), tmp_path / "out", frames=1).path
+        assert read_content(out)["scene"]["seed"] == 2**70
+
     def test_every_frame_has_its_files_and_a_line(self, scene, tmp_path):
         told = []
         summary = write(scene, tmp_path / "out", progress=lambda *event: told.append(event))

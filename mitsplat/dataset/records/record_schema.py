@@ -74,7 +74,7 @@ class _Belt(_Stored):
 
 class _Scene(_Stored):
     name: str
-    seed: Count
+    seed: Annotated[int, Field(ge=0)]
     camera: CameraSpec
     labels: LabelRules
     output: Output

@@ -178,7 +178,7 @@ def start_development(
     balance = _white_point_matrix(composite, np.divide(light, white))
     if composite.exposure != "fixed":
         stops = (
-            metered_exposure(linear, shape[0] * shape[1], composite.tone, LUMINANCE @ balance)
+            metered_exposure(linear, shape, composite.tone, LUMINANCE @ balance)
             if composite.exposure == "auto"
             else camera_exposure(composite.exposure, white)
         )
@@ -234,13 +234,17 @@ class Development:
         return image if self.jpeg is None else _jpeg_compressed(image, self.jpeg)
 
 
-def metered_exposure(linear: mi.Color3f, num_pixels: int, tone: Tone, weights: Float64Array) -> float:
+def metered_exposure(linear: mi.Color3f, shape: tuple[int, int], tone: Tone, weights: Float64Array) -> float:
     """Compute the exposure [stops], within 30 stops, at which the encoded luminance has the mean :data:`GREY`.
 
     The luminance is that after white balance: ``weights`` (3,) times linear sRGB before it. The mean is taken after
     encoding, so that clipped lamps weigh no more than white paper. It is estimated from evenly spaced pixels.
     """
-    sampled_pixels = dr.arange(mi.UInt32, 0, num_pixels, max(1, num_pixels // _METERED_PIXELS))
+    num_pixels = shape[0] * shape[1]
+    step = max(1, num_pixels // _METERED_PIXELS)
+    while math.gcd(step, shape[1]) > 1:  # a common divisor would leave columns out
+        step += 1
+    sampled_pixels = dr.arange(mi.UInt32, 0, num_pixels, step)
     dr.eval(linear)
     luminance = np.maximum(np.float32(weights) @ dr.gather(mi.Color3f, linear, sampled_pixels).numpy(), 0.0)
     curve = 255.0 * np.clip(tone_curve(tone), 0.0, 1.0)

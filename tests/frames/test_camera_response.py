@@ -410,5 +410,13 @@ def test_metering_counts_a_lamp_as_white_at_most() -> None:
     assert np.array_equal(develop(lamp, {}, metered), develop(paper, {}, metered))
 
 
+@pytest.mark.parametrize("size", [(1024, 1024), (16384, 96), (8, 8192)])
+def test_metering_samples_all_columns_of_a_picture(size: tuple[int, int]) -> None:
+    width, height = size
+    stripes = np.where(np.arange(width) // max(1, width // 32) % 2, 0.5, 0.02).astype(np.float32)
+    picture = np.broadcast_to(stripes[None, :, None], (height, width, 3)).copy()
+    assert develop(picture, {}, Composite(exposure="auto")).mean() == pytest.approx(GREY, abs=1)
+
+
 def test_metering_of_a_black_picture_stays_black() -> None:
     assert develop(np.zeros((9, 16, 3), np.float32), {}, Composite(exposure="auto")).max() == 0

@@ -87,6 +87,8 @@ def render_frames(
             )
             if next_camera is None:  # the scene's next view is not part of the film
                 frame = replace(frame, plan=replace(frame.plan, next_camera=None))
+            elif following is not None:
+                frame = _run_belt(scene, frame, following)
             yield frame
 
 
@@ -122,6 +124,17 @@ def _next_view(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None
         view = next_index - layout_index_of(scene, next_index) * scene.spec.output.views
         next_layout = layout_at_view(scene.spec, next_layout, view)
     return next_layout, viewpoint_of(scene, next_index, next_layout).camera if next_camera is None else next_camera
+
+
+def _run_belt(scene: Scene, frame: Frame, following: Shot) -> Frame:
+    """Return a frame whose flow leads to the moment of the next image of a film; without a belt, the same frame."""
+    (next_index, next_layout, _), belt, conveyor = following, frame.plan.belt, scene.spec.conveyor
+    if belt is None or conveyor is None:
+        return frame
+    view = next_index % scene.spec.output.views
+    plan = replace(frame.plan, belt=replace(belt, interval=conveyor.interval * (view - frame.plan.view)))
+    moved = frame.next_layout if next_layout is not None else layout_at_view(scene.spec, frame.layout, view)
+    return replace(frame, plan=plan, next_layout=moved)
 
 
 def _one_per_frame(given: Item | Iterable[Item] | None) -> Iterator[Item | None]:

@@ -90,6 +90,27 @@ def test_the_flow_of_settled_layouts_equals_that_of_the_scene(belt_data: SceneDa
             np.testing.assert_array_equal(frame.flow, alone.flow)
 
 
+@pytest.mark.parametrize("given", [True, False], ids=["layouts", "cameras"])
+def test_the_flow_of_a_film_leads_to_its_next_view(
+    given: bool, belt_data: SceneData, write_scene: WriteScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A film may skip, repeat and reverse views: the belt and the objects on it have the motion between its images."""
+    monkeypatch.setattr("mitsplat.frames.frame.settle_layout", lying)
+    scene = ms.load_scene(write_scene(belt_data))
+    camera = ms.render_frame(scene, 0).camera
+    views = [0, 2, 2, 1]
+    film = list(ms.render_frames(scene, views, layouts=lying(scene, 0) if given else None, cameras=camera))
+    y = abs(np.arange(48) + 0.5 - 24) / 100 * 0.5
+    for frame, steps in zip(film, (2, 0, -1), strict=False):
+        flow = frame.flow
+        assert flow is not None
+        runs = (frame.instance == 1) | ((frame.instance == 0) & (y < 0.09)[:, None])
+        sure = runs & (flow[..., 0] < UNKNOWN_FLOW)
+        assert {0, 1} == set(frame.instance[sure].tolist())
+        np.testing.assert_allclose(flow[..., 0][sure], steps * 100 * STEP / frame.depth[sure], atol=2e-3)
+    assert film[-1].flow is None
+
+
 def test_the_pattern_moves_with_the_belt(belt_data: SceneData, write_scene: WriteScene) -> None:
     belt_data["objects"] = []
     scene = ms.load_scene(write_scene(belt_data))

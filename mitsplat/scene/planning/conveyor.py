@@ -35,7 +35,7 @@ class Belt:
         box: Box of the belt, which runs along its own x axis.
         speed: Speed of the belt surface [m/s].
         time: Time since the moment at which the layout is as it settled [s]; negative before it.
-        interval: Time until the next image of the layout [s]; 0 if there is none.
+        interval: Time until the next image of the layout [s]; 0 if there is none. Negative in a film that runs back.
     """
 
     box: Box

@@ -10,7 +10,7 @@ from mitsplat.audit.decoded_frame import DecodedFrame
 from mitsplat.storage.files import JsonObject
 
 _MAX_DEPTH = 1e-3
-"""Maximum depth of a carried object's origin below the top of the belt [m]."""
+"""Maximum depth of a carried object's centroid below the top of the belt [m]."""
 
 
 class BeltMotion:
@@ -24,22 +24,24 @@ class BeltMotion:
         scene = content["scene"]
         conveyor = None if content.get("given", False) else scene.get("conveyor")
         self._box: JsonObject | None = None
+        self._centroids = content.get("centroids") or [(0.0, 0.0, 0.0)] * len(content["assets"])
         self._step, self._last_view = np.zeros(3), scene["output"]["views"] - 1
         if conveyor is not None:
             self._box = next(shape["box"] for shape in scene["shapes"] if shape["name"] == conveyor["belt"])
             self._turn = Rotation.from_euler("xyz", self._box["rotate"], degrees=True)
             self._step = conveyor["interval"] * conveyor["speed"] * self._turn.apply((1.0, 0.0, 0.0))
 
-    def carries(self, pose: Float64Array) -> bool:
-        """Return True if the belt carries an object at a pose (4, 4), because the object's origin is above the belt."""
+    def carries(self, asset: int, pose: Float64Array) -> bool:
+        """Return True if the belt carries an object of an asset at a pose (4, 4): its centroid is above the belt."""
         if self._box is None:
             return False
-        position, half = self._turn.inv().apply(pose[:3, 3] - self._box["position"]), np.array(self._box["size"]) / 2
+        place = pose[:3, :3] @ self._centroids[asset] + pose[:3, 3]
+        position, half = self._turn.inv().apply(place - self._box["position"]), np.array(self._box["size"]) / 2
         return bool((abs(position[:2]) <= half[:2]).all() and position[2] > half[2] - _MAX_DEPTH)
 
-    def displacement(self, pose: Float64Array, frame: DecodedFrame) -> Float64Array:
+    def displacement(self, asset: int, pose: Float64Array, frame: DecodedFrame) -> Float64Array:
         """Return the displacement at the time of a frame of an object that settled at a pose (4, 4) [m], shape (3,)."""
-        return self._travel(frame) if self.carries(pose) else np.zeros(3)
+        return self._travel(frame) if self.carries(asset, pose) else np.zeros(3)
 
     def between(self, frame: DecodedFrame, following: DecodedFrame) -> Float64Array:
         """Return the displacement of the belt between two frames of the same layout [m], shape (3,)."""

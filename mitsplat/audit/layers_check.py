@@ -118,7 +118,7 @@ class LayersCheck(DatasetCheck):
             motion, seen = np.eye(4), np.zeros((height, width), dtype=bool)
             motion[:3, 3] = self._belt.between(before, frame) if carried else 0.0
             for instance in before.instances:
-                if self._belt.carries(instance.pose) == carried:
+                if self._belt.carries(instance.entry["asset"], instance.pose) == carried:
                     seen |= before.full_mask(instance)
             yield seen, motion
 

@@ -45,7 +45,7 @@ class LayoutCheck(DatasetCheck):
                 yield line, f"{label.name} is not in {file}"
             elif (entry.get("asset"), entry.get("class_index")) != (label.entry["asset"], label.class_index):
                 yield line, f"{label.name} is of another asset or class than in {file}"
-            elif not is_close(self._pose_at(entry.get("world_from_object"), frame), label.pose, 1e-12):
+            elif not is_close(self._pose_at(entry, frame), label.pose, 1e-12):
                 yield line, f"{label.name} has another pose than in {file}"
         dropped = Counter(frame.record["labels"]["dropped"])
         del dropped["fragments"]
@@ -59,12 +59,13 @@ class LayoutCheck(DatasetCheck):
         ]:
             yield line, f"its objects differ from those of {file}"
 
-    def _pose_at(self, stored: object, frame: DecodedFrame) -> object:
-        """Return a stored pose at the time of a frame, displaced by the belt if the belt carries the object."""
+    def _pose_at(self, entry: JsonObject, frame: DecodedFrame) -> object:
+        """Return an object's stored pose at the time of a frame, displaced by the belt if it carries the object."""
+        stored = entry.get("world_from_object")
         try:
             pose = np.array(stored, dtype=np.float64)
         except (TypeError, ValueError):
             return stored
         if pose.shape == (4, 4):
-            pose[:3, 3] += self._belt.displacement(pose, frame)
+            pose[:3, 3] += self._belt.displacement(entry["asset"], pose, frame)
         return pose

@@ -304,6 +304,7 @@ def content_of(scene: Scene, catalogue: Catalogue, device: Kind) -> JsonObject:
         "keypoints": [list(names) for names in catalogue.keypoint_names],
         "assets": list(catalogue.assets),
         **({"distractors": list(catalogue.distractors)} if catalogue.distractors else {}),
+        **({"centroids": list(map(list, scene.centroids))} if scene.spec.conveyor is not None else {}),
         "inputs": describe_inputs(scene),
         "libraries": {name: importlib.metadata.version(name) for name in libraries},
     }

@@ -310,10 +310,10 @@ class Renderer:
 
     def _layouts_at_views(self, layout: Layout, index: int) -> tuple[Layout, Layout | None]:
         """Return the layout at the moments of a frame and of the next view; None for the latter if nothing moves."""
-        spec = self.scene.spec
-        view = index - layout_index_of(self.scene, index) * spec.output.views
-        here = layout_at_view(spec, layout, view)
-        after = layout_at_view(spec, layout, min(view + 1, spec.output.views - 1))
+        views = self.scene.spec.output.views
+        view = index - layout_index_of(self.scene, index) * views
+        here = layout_at_view(self.scene, layout, view)
+        after = layout_at_view(self.scene, layout, min(view + 1, views - 1))
         return here, None if after is here else after
 
     def _build_scene(self, layout: Layout, plan: FramePlan, *, replaced_lights: bool) -> mi.Scene:
@@ -329,7 +329,7 @@ class Renderer:
         """Start the camera response on the device, with blur by the motion of a belt."""
         motion, belt, flow = plan.viewpoint.get("motion"), plan.belt, None
         if motion is not None and belt is not None:
-            carried = np.isin(layers.instance, list(carried_instances(layout, belt.box)))
+            carried = np.isin(layers.instance, list(carried_instances(self.scene, layout, belt.box)))
             flow = exposure_flow(layers.depth, plan.camera, motion["exposure"], belt, carried)
         composite, white = self.scene.spec.composite, self._white_irradiance(layout.index)
         is_balanced = composite.white_balance == "auto" and mitsuba_scene.emitters()

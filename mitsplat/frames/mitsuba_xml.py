@@ -57,7 +57,7 @@ def export_xml(scene: Scene, index: int, path: str | Path) -> None:
     path = Path(path)
     files = path.with_name(f"{path.stem}_files")
     number = layout_index_of(scene, index)
-    layout = layout_at_view(scene.spec, settle_layout(scene, number), index - number * scene.spec.output.views)
+    layout = layout_at_view(scene, settle_layout(scene, number), index - number * scene.spec.output.views)
     plan = plan_frame(scene, index, layout)
     if files.is_symlink():
         raise InputError(f"{files}: must not be a link, because files are written into it; remove the link")

@@ -122,7 +122,7 @@ def _next_view(scene: Scene, shot: Shot, following: Shot) -> tuple[Layout | None
         return None, None
     if next_layout is not None:
         view = next_index - layout_index_of(scene, next_index) * scene.spec.output.views
-        next_layout = layout_at_view(scene.spec, next_layout, view)
+        next_layout = layout_at_view(scene, next_layout, view)
     return next_layout, viewpoint_of(scene, next_index, next_layout).camera if next_camera is None else next_camera
 
 
@@ -133,7 +133,7 @@ def _run_belt(scene: Scene, frame: Frame, following: Shot) -> Frame:
         return frame
     view = next_index % scene.spec.output.views
     plan = replace(frame.plan, belt=replace(belt, interval=conveyor.interval * (view - frame.plan.view)))
-    moved = frame.next_layout if next_layout is not None else layout_at_view(scene.spec, frame.layout, view)
+    moved = frame.next_layout if next_layout is not None else layout_at_view(scene, frame.layout, view)
     return replace(frame, plan=plan, next_layout=moved)
 
 

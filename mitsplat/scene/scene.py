@@ -9,6 +9,7 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import trimesh
 
 from mitsplat.arguments import check_type, checks_arguments
@@ -92,6 +93,15 @@ class Scene:
         """For each entry of ``spec.objects``, the indices of its assets."""
         ends = list(accumulate((len(entry.names) * len(entry.scales) for entry in self.spec.objects), initial=0))
         return tuple(range(*ends) for ends in pairwise(ends))
+
+    @cached_property
+    def centroids(self) -> tuple[tuple[float, float, float], ...]:
+        """For each asset, the centroid of its mesh in its frame, rounded to micrometres [m].
+
+        It is inside the convex hull of the object, unlike its origin, which may be anywhere.
+        """
+        found = (np.zeros(3) if asset.mesh is None else asset.mesh.centroid for asset in self.assets)
+        return tuple((x, y, z) for x, y, z in (centroid.round(6).tolist() for centroid in found))
 
     def entry_of(self, asset: int) -> ObjectSpec:
         """Return the entry of ``spec.objects`` to which an asset belongs."""

@@ -99,7 +99,7 @@ def frame_content(scene: Scene, index: int) -> FrameContent:
         InputError: If there is no such frame, or its layout does not settle.
     """
     number = layout_index_of(scene, index)
-    layout = layout_at_view(scene.spec, settle_layout(scene, number), index % scene.spec.output.views)
+    layout = layout_at_view(scene, settle_layout(scene, number), index % scene.spec.output.views)
     plan = plan_frame(scene, index, layout)
     environment = scene.environment_of(number)
     with warp_settings():

@@ -145,7 +145,7 @@ class SceneRenders:
         if number not in self._layouts:
             self._note(f"settling layout {number}")
             self._layouts[number] = settle_layout(scene, number, progress=self._note)
-        return layout_at_view(scene.spec, self._layouts[number], index % scene.spec.output.views)
+        return layout_at_view(scene, self._layouts[number], index % scene.spec.output.views)
 
     def render(self, request: ViewRequest, preset: PresetName) -> Preview:
         """Render the view with one preset."""

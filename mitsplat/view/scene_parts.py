@@ -289,7 +289,7 @@ def camera_parts(scene: Scene, index: int, layout: Layout | None) -> Iterator[Sh
     spread = np.linspace(0, scene.num_frames - 1, min(scene.num_frames, MAX_CAMERAS)).astype(int)
     size = float(np.linalg.norm(np.subtract(scene.spec.region.max, scene.spec.region.min)))
     for frame in sorted({*own[:MAX_CAMERAS], *spread.tolist()}):
-        there = None if layout is None or frame not in own else layout_at_view(scene.spec, layout, frame % views)
+        there = None if layout is None or frame not in own else layout_at_view(scene, layout, frame % views)
         camera = viewpoint_of(scene, frame, there).camera
         group, colour = ("cameras", _CAMERA) if frame in own else ("other cameras", _OTHER)
         yield ShownPart(f"/{group}/{frame}", Frustum(camera, 0.15 * size, colour, frame), camera.world_from_camera)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,12 @@ from mitsplat.audit.audit import audit_dataset
 from mitsplat.dataset.rerender import rerender_frame
 from mitsplat.dataset.write import write_dataset
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.labels.flow import UNKNOWN_FLOW, exposure_flow
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.planning.conveyor import Belt
 from mitsplat.scene.spec.shape_spec import Box
-from tests.conftest import WriteScene
+from tests.conftest import WriteScene, box_asset
 from tests.manifests import records_of, store
 
 SceneData = dict[str, Any]
@@ -28,10 +31,10 @@ STEP = 0.02
 """Travel of the belt between views [m]: 4 pixels at a distance of 0.5 m and a focal length of 100 px."""
 
 
-def lying(scene: ms.Scene, index: int, **_: Any) -> Layout:
-    """Return a layout of two large nuts: one on the belt, one beside it."""
+def lying(scene: ms.Scene, index: int, *, origin: Sequence[float] = (0.0, 0.0, 0.0), **_: Any) -> Layout:
+    """Return a layout of two large nuts: one on the belt, one beside it. Their origin is at a distance from them."""
     poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[:, :3, 3] = (0.0, 0.0, 0.02), (0.0, 0.14, 0.02)
+    poses[:, :3, 3] = np.add([(0.0, 0.0, 0.02), (0.0, 0.14, 0.02)], origin)
     instances = [Instance(i, 0, scene.class_index(0), pose) for i, pose in enumerate(poses, start=1)]
     return Layout(index, tuple(instances), replace(NO_PHYSICS, attempts=1))
 
@@ -153,21 +156,27 @@ def test_moving_surfaces_are_swept_by_the_exposure(lens: dict[str, Any], error: 
     np.testing.assert_allclose(np.stack([right, down], axis=-1), expected, atol=error)
 
 
-def test_a_dataset_with_a_belt_has_no_violations(belt_data: SceneData, write_scene: WriteScene, tmp_path: Path) -> None:
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.02, 0.3, 0.1)], ids=["inside", "beside"])
+def test_a_dataset_with_a_belt_has_no_violations(
+    origin: tuple[float, float, float], belt_data: SceneData, write_scene: WriteScene, tmp_path: Path
+) -> None:
     """Labels follow the carried objects, the audit accepts their poses, and a remade frame is identical."""
+    away = homogeneous_matrix(np.eye(3), np.negative(origin))  # of the asset from its origin, before scaling
+    box_asset("nut").transformed(away).save(tmp_path / "assets/nut")
     belt_data["labels"] = {"min_pixels": 1, "min_fragment": 1}
     belt_data["camera"]["motion"] = {"exposure": [0.01, 0.02]}
     belt_data["output"]["formats"] = ["yolo", "coco", "poses", "bop", "flow", "depth", "colmap"]
     scene = ms.load_scene(write_scene(belt_data))
-    out = write_dataset(scene, tmp_path / "out", settle=lying, workers=1).path
+    settle = partial(lying, origin=2 * np.array(origin))
+    out = write_dataset(scene, tmp_path / "out", settle=settle, workers=1).path
     assert audit_dataset(out).violations == ()
     records = records_of(out)
     places = np.array([[label["world_from_object"][0][3] for label in r["labels"]["instances"]] for r in records])
-    np.testing.assert_allclose(places, [[-STEP, 0], [0, 0], [STEP, 0]] * 2, atol=1e-15)
+    np.testing.assert_allclose(places, np.array([[-STEP, 0], [0, 0], [STEP, 0]] * 2) + 2 * origin[0], atol=1e-15)
     assert [record["conveyor"]["time"] for record in records] == pytest.approx([-0.1, 0, 0.1] * 2)
     boxes = [record["labels"]["instances"][0]["box"][0] for record in records[:3]]
     assert boxes[2] - boxes[1] == boxes[1] - boxes[0] == pytest.approx(100 * STEP / 0.47, abs=1)
-    again = rerender_frame(scene, 2, tmp_path / "again", dataset=out, settle=lying)
+    again = rerender_frame(scene, 2, tmp_path / "again", dataset=out, settle=settle)
     assert again.compared and not again.differing
     # The audit reports a layout with another pose.
     stored = json.loads((out / "layouts/0000.json").read_bytes())

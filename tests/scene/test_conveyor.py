@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from mitsplat.errors import InputError
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.scene.layout import NO_PHYSICS, Instance, Layout
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.conveyor import layout_at_view
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.scene import Scene
-from tests.conftest import WriteScene
+from tests.conftest import WriteScene, box_asset
 
 SceneData = dict[str, Any]
 SETTLED = replace(NO_PHYSICS, attempts=1)
@@ -50,33 +51,46 @@ def test_objects_above_the_belt_move_along_it(belt_data: SceneData, write_scene:
     """Another box, which is the first shape, is beside the belt."""
     post = {"size": [0.1, 0.1, 1], "position": [0, 0.9, 0]}
     belt_data["shapes"].insert(0, {"name": "post", "box": post, "visible": True})
-    spec = scene_of(belt_data, write_scene).spec
+    scene = scene_of(belt_data, write_scene)
     beside, below = (0.0, 0.45, 0.01), (0.0, 0.0, -0.2)
     layout = lying((0.1, 0.0, 0.01), beside, below, (-0.1, 0.05, 0.3))
     along = np.array([np.cos(np.pi / 6), 0.5, 0.0])
     for view, time in enumerate((-0.15, -0.05, 0.05, 0.15)):
-        moved = places_of(layout_at_view(spec, layout, view)) - places_of(layout)
+        moved = places_of(layout_at_view(scene, layout, view)) - places_of(layout)
         np.testing.assert_allclose(moved[[0, 3]], [0.2 * time * along] * 2, atol=1e-15)
         np.testing.assert_array_equal(moved[[1, 2]], 0)
 
 
+def test_objects_are_carried_wherever_their_origin_is(belt_data: SceneData, write_scene: WriteScene) -> None:
+    """The origin of a CAD part may be far from the part."""
+    away = np.array([0.1, 0.5, 0.2])
+    cad = box_asset("cad").transformed(homogeneous_matrix(np.eye(3), away))
+    cad.save(write_scene(belt_data).parent / "assets/cad")
+    scene = scene_of(belt_data | {"objects": [{"asset": "assets/cad", "count": 2}]}, write_scene)
+    layout = lying(*(np.array([(0.1, 0.0, 0.01), (0.0, 0.45, 0.01)]) - away).tolist())
+    moved = places_of(layout_at_view(scene, layout, 3)) - places_of(layout)
+    np.testing.assert_allclose(moved, [0.03 * np.array([np.cos(np.pi / 6), 0.5, 0.0]), np.zeros(3)], atol=1e-15)
+
+
 def test_a_layout_moves_from_its_settled_poses(belt_data: SceneData, write_scene: WriteScene) -> None:
-    spec = scene_of(belt_data, write_scene).spec
+    scene = scene_of(belt_data, write_scene)
     layout = lying((0.1, 0.0, 0.01))
-    last = layout_at_view(spec, layout, 3)
-    assert layout_at_view(spec, last, 3) is last
-    np.testing.assert_array_equal(places_of(layout_at_view(spec, last, 0)), places_of(layout_at_view(spec, layout, 0)))
+    last = layout_at_view(scene, layout, 3)
+    assert layout_at_view(scene, last, 3) is last
+    np.testing.assert_array_equal(
+        places_of(layout_at_view(scene, last, 0)), places_of(layout_at_view(scene, layout, 0))
+    )
 
 
 def test_given_poses_do_not_move(belt_data: SceneData, write_scene: WriteScene) -> None:
     scene = scene_of(belt_data, write_scene)
     given = Layout.from_poses(scene, {"nut": [np.eye(4)]})
-    assert layout_at_view(scene.spec, given, 0) is given
+    assert layout_at_view(scene, given, 0) is given
 
 
 def test_a_scene_without_a_belt_keeps_its_layout(scene_data: SceneData, write_scene: WriteScene) -> None:
     layout = lying((0.1, 0.0, 0.01))
-    assert layout_at_view(scene_of(scene_data, write_scene).spec, layout, 1) is layout
+    assert layout_at_view(scene_of(scene_data, write_scene), layout, 1) is layout
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,7 @@ class _Content(_Stored):
     keypoints: list[list[Name]]
     assets: list[Name]
     distractors: list[Count] = []
+    centroids: list[Point] = []
     libraries: dict[str, str]
     device: Literal["cpu", "cuda"] = "cpu"
     given: bool = False
@@ -297,6 +298,11 @@ def read_content(root: Path) -> JsonObject:
         raise InputError(
             f"{root / 'dataset.json'}: keypoints must have one list per class "
             f"(got {len(content['keypoints'])} lists for {len(content['classes'])} classes)"
+        )
+    if len(content.get("centroids", [])) not in (0, len(content["assets"])):
+        raise InputError(
+            f"{root / 'dataset.json'}: centroids must have one point per asset "
+            f"(got {len(content['centroids'])} points for {len(content['assets'])} assets)"
         )
     if not (root / "manifest.jsonl").is_file():
         raise InputError(f"{root}: must be a dataset of mitsplat (it has no manifest.jsonl)")

@@ -16,12 +16,14 @@ import trimesh
 
 from mitsplat.arrays import BoolArray, Float64Array
 from mitsplat.errors import InputError
+from mitsplat.geometry.rigid import transform_points
 from mitsplat.scene.spec.scene_spec import SceneSpec
 from mitsplat.scene.spec.shape_spec import Box
 from mitsplat.scene.walls import pose_matrix
 
 if TYPE_CHECKING:
     from mitsplat.scene.layout import Layout
+    from mitsplat.scene.scene import Scene
 
 _NEAR = 1e-3
 """Maximum distance of a belt point from the top of the belt [m]."""
@@ -76,28 +78,28 @@ def belt_of(spec: SceneSpec, view: int) -> Belt | None:
     return Belt(box, spec.conveyor.speed, time, interval if view + 1 < views else 0.0)
 
 
-def layout_at_view(spec: SceneSpec, layout: Layout, view: int) -> Layout:
+def layout_at_view(scene: Scene, layout: Layout, view: int) -> Layout:
     """Return a settled layout at the moment of a view. Layouts with given poses are returned unchanged.
 
     Args:
-        spec: The scene, with or without a conveyor.
+        scene: The scene, with or without a conveyor.
         layout: The layout as it settled, or at the moment of another view.
         view: Index of the view in the layout.
     """
-    belt, settled = belt_of(spec, view), layout.settled or layout
+    belt, settled = belt_of(scene.spec, view), layout.settled or layout
     if belt is None or not settled.certificate.attempts:  # without physics, poses are given
         return layout
-    return _shifted_layout(settled, belt.box, tuple((belt.time * belt.velocity).tolist()))
+    return _shifted_layout(scene, settled, belt.box, tuple((belt.time * belt.velocity).tolist()))
 
 
 @lru_cache(maxsize=4)
-def _shifted_layout(settled: Layout, box: Box, offset: Sequence[float]) -> Layout:
+def _shifted_layout(scene: Scene, settled: Layout, box: Box, offset: Sequence[float]) -> Layout:
     """Return the layout with the carried objects moved by a vector [m].
 
     The cache returns the identical layout for all views of a moment, so that the renderer can skip unchanged geometry.
     """
     instances = []
-    moving = carried_instances(settled, box)
+    moving = carried_instances(scene, settled, box)
     for instance in settled.instances:
         pose = instance.world_from_object
         if instance.id in moving:
@@ -107,11 +109,11 @@ def _shifted_layout(settled: Layout, box: Box, offset: Sequence[float]) -> Layou
     return replace(settled, instances=tuple(instances), settled=settled)
 
 
-def carried_instances(layout: Layout, box: Box) -> frozenset[int]:
-    """Return the ids of the instances that a belt carries: those whose origin was above it after settling."""
+def carried_instances(scene: Scene, layout: Layout, box: Box) -> frozenset[int]:
+    """Return the ids of the instances that a belt carries: those whose centroid was above it after settling."""
     settled = (layout.settled or layout).instances
-    places = np.array([instance.world_from_object[:3, 3] for instance in settled]).reshape(-1, 3)
-    above = _above_box(box, places, np.inf)
+    places = [transform_points(one.world_from_object, np.array(scene.centroids[one.asset])) for one in settled]
+    above = _above_box(box, np.array(places).reshape(-1, 3), np.inf)
     return frozenset(instance.id for instance, is_above in zip(settled, above, strict=True) if is_above)
 
 

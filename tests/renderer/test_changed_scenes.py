@@ -14,6 +14,7 @@ import trimesh
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.renderer.layers import make_integrator, make_splats_shape
+from mitsplat.renderer.meshes.mirrored_splats import SplatMirror
 from mitsplat.runtime.variant import ensure_variant
 from tests.renderer.test_light import WHITE_SKY, floor, nothing, slab
 
@@ -335,6 +336,26 @@ def test_the_scene_without_invisible_shapes_is_built_once(monkeypatch: pytest.Mo
     monkeypatch.setattr(mi, "load_dict", lambda *args, **options: loaded.append(args) or load(*args, **options))
     integrator.render(scene)
     assert not loaded
+
+
+def test_reflected_splats_are_built_again_only_if_splats_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, integrator = make_scene_in_a_box(), make_integrator(shadow_samples=4, mesh_samples=4)
+    built = []
+    build = SplatMirror.build
+    monkeypatch.setattr(SplatMirror, "build", lambda *arguments: built.append(1) or build(*arguments))
+    parameters = mi.traverse(scene)
+    counts = []
+    for key in ("ball.bsdf.alpha", "ball.to_world", "lamp.position", "floor.to_world"):
+        before = np.array(integrator.render(scene))
+        parameters[key] = moved(parameters[key]) if key.endswith("to_world") else parameters[key] * 0.5
+        parameters.update()
+        after = np.array(integrator.render(scene))
+        assert np.abs(after - before).max() > 0.01
+        counts.append(len(built))
+        truth = make_integrator(shadow_samples=4, mesh_samples=4).render(scene)
+        built.pop()
+        np.testing.assert_array_equal(after, np.array(truth))
+    assert counts == [1, 1, 1, 2]
 
 
 @pytest.mark.parametrize("name", ["bsdf", "interior"])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 
@@ -67,6 +68,7 @@ class ContentsReader:
         self._contents: SceneContents | None = None
         self._uploaded: list[tuple[Splats, Cloud]] = []
         self._grid: tuple[ShapeState, RadianceGrid | None] | None = None
+        self._mirror: tuple[ShapeState, SplatMirror | None] | None = None
 
     def read(self, scene: mi.Scene, splat_shadows: bool) -> SceneContents:
         """Upload the data of the shapes unless they are those of the last call.
@@ -92,16 +94,17 @@ class ContentsReader:
         if splat_shadows:
             casters = [Caster(c.splats, c.instance, c.world_from_splats) for c in carriers if c.dynamic]
         clouds, meshes = self._upload(distinct), VisibleMeshes.build(visible)
-        mirror = None
-        if meshes is not None and meshes.diffuse is not None:
-            mirror = SplatMirror.build(clouds, placements, distinct, [c.relit for c in carriers])
+        if meshes is None or meshes.diffuse is None:
+            self._mirror = None
+        else:
+            self._mirror = self._mirrored(carriers, clouds, placements, distinct)
         self._contents = SceneContents(
             state=ShapeState.of(shapes),
             clouds=clouds,
             placements=placements,
             proxies=Proxies(occluders, [s for s in visible if not is_transmissive(s.bsdf())], casters),
             meshes=meshes,
-            mirror=mirror,
+            mirror=None if self._mirror is None else self._mirror[1],
             traits=Traits.of(carriers, placements),
             grid=self._surroundings(carriers),
             mixed=MixedObjects.of(carriers, placements),
@@ -120,6 +123,20 @@ class ContentsReader:
             grid = RadianceGrid.build(largest.splats, largest.world_from_splats, largest.appearance)
             self._grid = ShapeState.of([largest]), grid
         return self._grid[1]
+
+    def _mirrored(
+        self,
+        carriers: list[mi.Shape],
+        clouds: CloudSet | None,
+        placements: Sequence[Placement],
+        distinct: Sequence[Splats],
+    ) -> tuple[ShapeState, SplatMirror | None]:
+        """Return the splats that meshes reflect, which take seconds to build; those of the last call if none moved."""
+        if self._mirror is None or not self._mirror[0].holds_for(carriers):
+            built = SplatMirror.build(clouds, placements, distinct, [c.relit for c in carriers])
+            return ShapeState.of(carriers), built
+        state, mirror = self._mirror
+        return state, None if mirror is None or clouds is None else replace(mirror, clouds=clouds)
 
     def _upload(self, distinct: list[Splats]) -> CloudSet | None:
         """Upload splats; copies of the last call are reused, because layouts of a scene share their assets."""

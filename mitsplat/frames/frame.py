@@ -97,6 +97,11 @@ class Frame(LazyValue):
         return self.layers.instance
 
     @property
+    def normal(self) -> Float32Array:
+        """Unit normals of the proxy meshes in world coordinates, 0 for no surface, (H, W, 3)."""
+        return self.layers.normal
+
+    @property
     def flow(self) -> Float32Array | None:
         """Motion of every pixel to the next image [px], (H, W, 2); None without a next image.
 
@@ -234,7 +239,7 @@ class Renderer:
                 changed since its creation.
         """
         self._check_variant()
-        _check_types(layout, camera, next_layout, next_camera)
+        _check_types(self.scene, layout, camera, next_layout, next_camera)
         seconds: dict[str, float] = {}
         if layout is None:
             with _timed(seconds, "settle"):
@@ -361,12 +366,23 @@ class Renderer:
 
 
 def _check_types(
-    layout: Layout | None, camera: Camera | None, next_layout: Layout | None, next_camera: Camera | None
+    scene: Scene, layout: Layout | None, camera: Camera | None, next_layout: Layout | None, next_camera: Camera | None
 ) -> None:
-    """Raise InputError if a given layout or camera has another type."""
+    """Raise InputError if a given layout or camera has another type, or a layout is of another scene."""
     for place, shown in (("layout", layout), ("next_layout", next_layout)):
         if shown is not None:
             check_type(shown, Layout, place, "create it by mitsplat.Layout.from_poses(scene, poses)")
+            _check_assets(shown, scene, place)
     for place, seen in (("camera", camera), ("next_camera", next_camera)):
         if seen is not None:
             check_type(seen, Camera, place, "create it by mitsplat.Camera or mitsplat.Camera.look_at")
+
+
+def _check_assets(layout: Layout, scene: Scene, place: str) -> None:
+    """Raise InputError if an object of a layout has an asset or a class that the scene does not have."""
+    for asset, class_index in {(instance.asset, instance.class_index) for instance in layout.instances}:
+        if asset >= len(scene.assets) or class_index != scene.class_index(asset):
+            raise InputError(
+                f"{place} must be of a scene with the same objects (got an object of asset {asset} and class "
+                f"{class_index}, which {scene.path} does not have)"
+            )

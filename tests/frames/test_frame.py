@@ -64,6 +64,7 @@ def test_a_frame_shows_and_labels_its_objects(scene: ms.Scene, settled: dict[str
         assert x0 - 8 <= centre[0, 0] <= x1 + 8 and y0 - 8 <= centre[0, 1] <= y1 + 8
     assert set(frame.seconds) >= {"render", "composite", "label"}
     assert frame._repr_png_().startswith(b"\x89PNG")
+    assert frame.normal is frame.layers.normal
 
 
 def test_values_print_on_one_line_without_arrays(scene: ms.Scene, settled: dict[str, Any]) -> None:

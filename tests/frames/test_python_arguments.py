@@ -138,6 +138,21 @@ def test_arguments_of_another_type_are_refused(
     assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("change", [{"label": False}, {"class_name": "other"}, None])
+def test_a_layout_of_another_scene_is_refused(
+    scene: ms.Scene, scene_data: dict[str, Any], write_scene: WriteScene, change: dict[str, Any] | None
+) -> None:
+    """Without this check, its indices select assets of the scene: other objects are rendered under other classes."""
+    layout = ms.Layout.from_poses(scene, {"nut": [POSE] * 3, "bolt": [POSE]})
+    entries = scene_data["objects"]
+    entries[1] |= change or {}
+    other = ms.load_scene(write_scene(scene_data | {"objects": entries if change else entries[:1]}))
+    with pytest.raises(
+        ms.InputError, match=r"^layout must be of a scene with the same objects \(got an object of asset"
+    ):
+        ms.render_frame(other, 0, layout=layout)
+
+
 def test_a_stream_of_a_scene_file_is_refused() -> None:
     pytest.importorskip("torch")
     from mitsplat.frames.torch_dataset import FrameStream

@@ -37,6 +37,19 @@ class StrictModel(BaseModel, metaclass=_InputErrorMeta):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    def __setattr__(self, name: str, value: object) -> None:
+        """Refuse changes, and name the way to a changed copy."""
+        raise InputError(f"{type(self).__name__}: must not be changed: use model_copy(update={{{name!r}: ...}})")
+
+
+def validate_again(value: Any) -> Any:
+    """Return a model with validated values, because pydantic's ``model_copy`` validates none. Other values are kept."""
+    if isinstance(value, list | tuple):
+        return tuple(map(validate_again, value))
+    if not isinstance(value, StrictModel):
+        return value
+    return type(value)(**{name: validate_again(getattr(value, name)) for name in sorted(value.model_fields_set)})
+
 
 def check_order(bounds: tuple[float, float]) -> tuple[float, float]:
     """Refuse a range with low > high."""

@@ -105,6 +105,37 @@ def test_errors_in_parts_of_a_specification_name_the_part() -> None:
         CameraOrbit(kind="orbit", target=(0, 0, 0), radius=-1, height=0.4)
 
 
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"composite": {"exposure": "fixd"}}, "SceneSpec: composite.exposure: must be"),
+        ({"sead": 3}, "SceneSpec: sead: is not a known key"),
+        ({"seed": -1}, "SceneSpec: seed: must be >= 0"),
+    ],
+)
+def test_an_invalid_copy_of_a_specification_is_refused_with_its_key(
+    scene: ms.Scene, change: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(ms.InputError, match=f"^{sentence}"):
+        ms.make_scene(scene.spec.model_copy(update=change), scene.path.parent)
+    sensor = scene.spec.camera.intrinsics.model_copy(update={"fov_x": -3.0})
+    camera = scene.spec.camera.model_copy(update={"intrinsics": sensor})
+    with pytest.raises(ms.InputError, match=r"^Intrinsics: fov_x: must be > 0 \(got -3\.0\)"):
+        ms.make_scene(scene.spec.model_copy(update={"camera": camera}), scene.path.parent)
+
+
+def test_parts_of_a_copied_specification_may_be_mappings(scene: ms.Scene) -> None:
+    change = {"composite": {"exposure": "fixed"}, "lights": [{"kind": "environment"}]}
+    changed = ms.make_scene(scene.spec.model_copy(update=change), scene.path.parent).spec
+    assert (changed.composite.exposure, changed.lights[0].kind) == ("fixed", "environment")
+    assert changed.model_copy(update={"composite": scene.spec.composite, "lights": scene.spec.lights}) == scene.spec
+
+
+def test_a_changed_value_of_a_specification_names_the_way_to_a_copy(scene: ms.Scene) -> None:
+    with pytest.raises(ms.InputError, match=r"^Composite: must not be changed: use model_copy\(update=\{'exposure': "):
+        scene.spec.composite.exposure = "fixed"  # type: ignore[misc]
+
+
 def test_a_missing_asset_of_a_scene_made_in_python_is_refused(scene_data: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(ms.InputError, match=r"<python>\.yaml: objects\[0\]\.asset: .*assets/nut") as caught:
         ms.make_scene(ms.SceneSpec(**scene_data), tmp_path)

@@ -23,6 +23,7 @@ from mitsplat.scene.spec.scene_spec import SCHEMA_VERSION, SceneSpec
 from mitsplat.scene.spec.shape_spec import Region
 from mitsplat.scene.walls import backdrop_shapes, enclosure_walls
 from mitsplat.storage.calibration_files import refuse_calibration
+from mitsplat.storage.field_types import validate_again
 from mitsplat.storage.file_kinds import refuse_other_kinds
 from mitsplat.storage.files import JsonObject
 from mitsplat.storage.yaml_input import key_place, load_yaml
@@ -57,16 +58,17 @@ def make_scene(spec: SceneSpec, folder: str | Path = ".") -> Scene:
 
     Args:
         spec: The scene, created by ``ms.SceneSpec(name=..., region={"min": ...}, ...)``. Its keys are those of scene
-            files; a part can be a model or a mapping. It may name files anywhere.
+            files; a part can be a model or a mapping. It may name files anywhere. A changed copy of another
+            specification is made by ``scene.spec.model_copy(update={"composite": {"exposure": "fixed"}})``.
         folder: Folder to which paths are relative [the working directory].
 
     Raises:
-        InputError: If a named file is missing or invalid.
+        InputError: If a value of the specification is invalid, or a named file is missing or invalid.
     """
     check_type(
         spec, SceneSpec, "spec", "create it by mitsplat.SceneSpec(name=..., ...), or use mitsplat.load_scene(path)"
     )
-    return _build_scene(spec, Path(folder) / _PYTHON_SCENE_NAME, allow_outside=True)
+    return _build_scene(validate_again(spec), Path(folder) / _PYTHON_SCENE_NAME, allow_outside=True)
 
 
 def _build_scene(spec: SceneSpec, path: Path, *, allow_outside: bool) -> Scene:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -91,8 +91,8 @@ class BakeResult:
     asset: Asset
     psnr: float = math.nan
     psnr_object: float = math.nan
-    views: tuple[BakedView, ...] = ()
-    surface: trimesh.Trimesh | None = None
+    views: tuple[BakedView, ...] = field(default=(), repr=False)
+    surface: trimesh.Trimesh | None = field(default=None, repr=False)
     brightness: float | None = None
     warnings: tuple[str, ...] = ()
     units: str = ""

@@ -187,7 +187,7 @@ def parse_pixel(text: str, place: str) -> tuple[float, float]:
 
 
 @checks_arguments
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Capture:
     """Photographs of one object or place, with the result of structure from motion.
 
@@ -232,6 +232,11 @@ class Capture:
         points.flags.writeable = colours.flags.writeable = False
         for name, value in (("photos", photos), ("points", points), ("colours", colours)):
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        rejected = f", {len(self.rejected)} rejected" if self.rejected else ""
+        units = "metres" if self.units == "metre" else "unknown units"
+        return f"Capture({len(self.photos)} photos{rejected}, {len(self.points)} points, {units})"
 
     @property
     def held_out(self) -> tuple[Photo, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from mitsplat.asset import Asset
 from mitsplat.gaussians.splat_cloud import Splats
@@ -45,14 +45,14 @@ class Imported:
     """
 
     asset: Asset
-    upright: Upright
+    upright: Upright = field(repr=False)
     found: int
     removed: dict[str, int]
     removed_splats: Splats
     support: ImportSupport | None
     watertight: bool
     topples: bool
-    views: Sequence[AssetView] = ()
+    views: Sequence[AssetView] = field(default=(), repr=False)
     mesh_iou: float | None = None
     offset: float | None = None
 

@@ -49,6 +49,10 @@ def capture(tmp_path: Path) -> Capture:
     )
 
 
+def test_a_capture_prints_on_one_line(capture: Capture) -> None:
+    assert repr(capture) == f"Capture({len(capture.photos)} photos, 1 rejected, 50 points, metres)"
+
+
 def test_a_saved_capture_is_loaded_unchanged(capture: Capture, tmp_path: Path) -> None:
     capture.save(tmp_path / "a")
     loaded = Capture.load(tmp_path / "a")

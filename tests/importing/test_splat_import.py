@@ -134,6 +134,11 @@ def imported(file: Path) -> Imported:
     return import_splats(file, name="pin", settings=settings, mass=0.3)
 
 
+def test_an_import_prints_on_one_line_without_arrays(imported: Imported) -> None:
+    assert "\n" not in repr(imported) and "array" not in repr(imported)
+    assert "Asset('pin'" in repr(imported)
+
+
 def test_an_imported_object_is_upright_clean_and_to_scale(imported: Imported, pin: trimesh.Trimesh) -> None:
     asset = imported.asset
     assert imported.removed["invisible"] == 2

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from mitsplat.findings import Finding
     from mitsplat.runtime.device import Device
 
+_INTERRUPTED = "interrupted: run the command again, without --overwrite, to continue"
+
 
 def select_device(name: str) -> None:
     """Select the device for all later computation and print the reason for the choice of ``auto``."""
@@ -51,7 +53,12 @@ def command_log(
         Function that returns a context manager for one progress callback.
     """
     if not json_log:
-        yield lambda: progress_bar(unit)
+        try:
+            yield lambda: progress_bar(unit)
+        except BaseException as error:
+            if exit_status(error) == INTERRUPTED:
+                typer.echo(f"mitsplat: {_INTERRUPTED}", err=True)
+            raise
         return
 
     def emit(event: str, **details: object) -> None:
@@ -69,7 +76,7 @@ def command_log(
             raise
         status, sentence = fault.outcome_of(error)
         if status == INTERRUPTED:
-            sentence = "interrupted: run the command again to continue"
+            sentence = _INTERRUPTED
         emit("failed", status=status, error=type(error).__name__, message=sentence)
         if status == INTERRUPTED:
             raise

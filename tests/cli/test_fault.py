@@ -126,6 +126,12 @@ def test_the_json_log_has_errors_of_scene_files(capsys: pytest.CaptureFixture[st
     assert (event["command"], event["status"], event["message"]) == ("render", 2, "gone.yaml: no such file")
 
 
-def test_an_interrupt_ends_with_status_130(scene_path: Path, write_dataset: Calls) -> None:
+def test_an_interrupt_ends_with_status_130_and_the_way_to_continue(
+    scene_path: Path, write_dataset: Calls, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_dataset.error = KeyboardInterrupt()
     assert run("render", scene_path) == 130
+    sentence = "interrupted: run the command again, without --overwrite, to continue"
+    assert capsys.readouterr().err == f"mitsplat: {sentence}\n"
+    assert run("render", scene_path, "--json") == 130
+    assert json.loads(capsys.readouterr().err.splitlines()[-1])["message"] == sentence

@@ -58,7 +58,8 @@ class SplatsShape(mi.Mesh):
 
      * - to_world
        - |transform|
-       - Rigid transform with uniform scale; ``mi.traverse`` can change it. (Default: none)
+       - Rigid transform with uniform scale; ``mi.traverse`` can change it. The axis of Mitsuba's ``rotate`` must have
+         length 1. (Default: none)
 
      * - instance
        - |int|

@@ -83,7 +83,10 @@ def split_similarity(matrix: npt.ArrayLike) -> tuple[Float64Array, float, Float6
     rotation = linear / scale
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > SIMILAR:
         lengths = ", ".join(f"{length:.6g}" for length in np.linalg.norm(linear, axis=0))
-        raise InputError(f"a transform must scale uniformly and not shear (got axes of lengths {lengths})")
+        raise InputError(
+            f"a transform must scale uniformly and not shear (got axes of lengths {lengths}): was it made by a "
+            "rotation about an axis of a length other than 1?"
+        )
     u, _, vt = np.linalg.svd(rotation)
     return u @ vt, scale, values[:3, 3]
 

@@ -188,6 +188,14 @@ def test_a_transform_that_deforms_moved_splats_is_refused() -> None:
         parameters.update()
 
 
+def test_a_rotation_about_an_axis_of_another_length_is_refused_with_its_cause() -> None:
+    """Mitsuba's `rotate` does not normalise the axis: the result is no rotation."""
+    ensure_variant()
+    pose = np.array(mi.ScalarTransform4f().rotate([1, 1, 0], 40).matrix)
+    with pytest.raises(InputError, match=r"about an axis of a length other than 1\?$"):
+        make_splats_shape(nothing(), pose)
+
+
 def test_the_seed_may_be_a_device_value() -> None:
     """Mitsuba's interface states `mi.UInt32`."""
     scene, integrator = make_scene(), make_integrator(shadow_samples=4)

@@ -225,6 +225,20 @@ def test_the_sharp_frame_at_the_border_of_a_step_is_chosen() -> None:
     assert [frame.index for frame in choose(measures, 150).frames][:3] == [1, 11, 21]
 
 
+def test_motion_counts_once_in_two_shots_and_frames_without_motion_are_left_out() -> None:
+    """The path continues over both shots; frames between them are the sharpest but not tracked."""
+    measures = [
+        FrameMeasure(
+            k, k / 30, MotionPosition(int(k > 54), 0.01 * k, tracked=not 50 <= k < 55), 9.0 if k >= 50 else 1.0
+        )
+        for k in range(101)
+    ]
+    choice = choose(measures, 150)
+    assert choice.moved == pytest.approx(0.49 + 0.45)
+    assert choice.cuts == (55 / 30,)
+    assert not {frame.index for frame in choice.frames} & set(range(50, 55))
+
+
 def turned_by(file: Path, degrees: int) -> Path:
     """Copy an MP4 with the rotation matrix that phones write for a rolled camera (ISO 14496-12, tkhd)."""
     data = bytearray(file.read_bytes())

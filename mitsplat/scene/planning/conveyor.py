@@ -89,17 +89,17 @@ def layout_at_view(scene: Scene, layout: Layout, view: int) -> Layout:
     belt, settled = belt_of(scene.spec, view), layout.settled or layout
     if belt is None or not settled.certificate.attempts:  # without physics, poses are given
         return layout
-    return _shifted_layout(scene, settled, belt.box, tuple((belt.time * belt.velocity).tolist()))
+    moving = carried_instances(scene, settled, belt.box)
+    return _shifted_layout(settled, moving, tuple((belt.time * belt.velocity).tolist()))
 
 
 @lru_cache(maxsize=4)
-def _shifted_layout(scene: Scene, settled: Layout, box: Box, offset: Sequence[float]) -> Layout:
-    """Return the layout with the carried objects moved by a vector [m].
+def _shifted_layout(settled: Layout, moving: frozenset[int], offset: Sequence[float]) -> Layout:
+    """Return the layout with the instances ``moving`` moved by a vector [m].
 
     The cache returns the identical layout for all views of a moment, so that the renderer can skip unchanged geometry.
     """
     instances = []
-    moving = carried_instances(scene, settled, box)
     for instance in settled.instances:
         pose = instance.world_from_object
         if instance.id in moving:

@@ -126,16 +126,16 @@ def agreed_masks(
 
     def make(photo: Photo) -> BoolArray:
         rough = small[photo.name][2] if photo.name in small else None
-        camera, bgr, mask = _reduce_photo(photo, 1 if rough is None else _extent_share(rough))
+        camera, bgr, _ = _reduce_photo(photo, 1 if rough is None else _extent_share(rough))
         unknown = _resize_occlusion(hidden.get(photo.name), camera)
         silhouette = _silhouette(hull, cell, camera)
         size = float(np.sqrt(np.count_nonzero(silhouette)))
-        if size > 0:
-            near = _dilate(silhouette, _BAND * size)
-            core = ~_dilate(~silhouette, _BAND * size)
-            free = _background_pixels(bare, camera, bgr)
-            mask = _segment(bgr, near, silhouette & (mask | core), core, free, unknown, _BAND * size)
-        return _resize_mask(mask, photo.camera)
+        if not size > 0:
+            return np.zeros((photo.camera.height, photo.camera.width), dtype=bool)
+        near = _dilate(silhouette, _BAND * size)
+        core = ~_dilate(~silhouette, _BAND * size)
+        free = _background_pixels(bare, camera, bgr)
+        return _resize_mask(_segment(bgr, near, core, core, free, unknown, _BAND * size), photo.camera)
 
     return make
 

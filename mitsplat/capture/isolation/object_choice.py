@@ -147,6 +147,7 @@ def _centrality(points: Float64Array, views: Sequence[PhotoView]) -> Float64Arra
         camera, shown = view.camera, view.seen
         pixels, _ = camera.project(points[shown])
         away = np.linalg.norm(pixels - np.array(camera.size) / 2, axis=1)
+        away[np.isnan(away)] = np.inf  # the model may state observations of points behind a camera
         central[shown] += np.exp(-0.5 * (away / (_IMAGE_SIGMA * max(camera.size))) ** 2)
     return central
 

@@ -72,6 +72,18 @@ def test_the_focus_is_the_point_at_which_most_cameras_are_directed() -> None:
     assert distance == pytest.approx(np.median(np.linalg.norm(eyes - (0.1, 0.0, 0.03), axis=1)), abs=0.01)
 
 
+def test_an_object_with_a_point_behind_a_camera_gets_no_preference(
+    place: tuple[Float64Array, Int64Array, list[PhotoView]],
+) -> None:
+    """Models of other programs state observations of points that their cameras cannot show."""
+    points, labels, views = place
+    inwards = views[0].camera
+    outwards = replace(inwards, world_from_camera=inwards.world_from_camera @ np.diag([-1.0, 1, -1, 1]))
+    wrong = PhotoView(outwards, np.flatnonzero(labels == 2)[:1].astype(np.int32))
+    views = [*views, wrong]
+    assert ball_of(choose_object(points, views).above, place) == {1}
+
+
 def test_picks_and_a_box_choose_another_object(place: tuple[Float64Array, Int64Array, list[PhotoView]]) -> None:
     points, _, views = place
     assert ball_of(choose_object(points, views, picks=[pick(place, 3)]).above, place) == {3}

@@ -289,7 +289,8 @@ def light_lines(estimate: LightEstimate, image: str) -> str:
         width, height = settings.distance * np.array(lamp.extents)
         lines.append(area_line(position, settings.around, (width, height), lamp.radiance))
     if settings.rest == "constant":
-        lines.append(f"  - {{kind: environment, {radiance_keys(estimate.ambient / np.pi)}}}")
+        if estimate.ambient.any():
+            lines.append(f"  - {{kind: environment, {radiance_keys(estimate.ambient / np.pi)}}}")
     else:
         turn = f", rotate_z: {settings.rotate_z:g}" if settings.rotate_z else ""
         lines.append(f"  - {{kind: environment, image: {json.dumps(image, ensure_ascii=False)}{turn}}}")

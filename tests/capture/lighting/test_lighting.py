@@ -26,6 +26,7 @@ from mitsplat.capture.lighting import (
     write_light,
 )
 from mitsplat.capture.lighting.brackets import merge_exposures, read_photograph
+from mitsplat.capture.lighting.estimate import light_lines
 from mitsplat.capture.lighting.lamps import Lamp, rectangle_axes, rectangle_irradiance
 from mitsplat.capture.lighting.mirror_ball import find_ball, unwrap_ball
 from mitsplat.capture.lighting.panorama import directions, level_irradiance, level_weights, solid_angles, unit_vector
@@ -252,6 +253,11 @@ class TestLines:
             assert environment.rotate_z == 40.0
             sent += level_irradiance(panorama.read_radiance(scene.images[environment.image]))
         np.testing.assert_allclose(sent, level_irradiance(sky), rtol=1e-3)
+
+    def test_black_surroundings_of_lamps_add_no_light(self) -> None:
+        found = estimated(painted((10, 60, 6, 20.0), rest=0.0), rest="constant")
+        lines = YAML(typ="safe").load(light_lines(found, "rest.exr"))
+        assert [light["kind"] for light in lines["lights"]] == ["area"]
 
     def test_a_stated_irradiance_scales_all_lights(self) -> None:
         sky = painted((10, 60, 6, 20.0))

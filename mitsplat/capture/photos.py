@@ -29,6 +29,8 @@ SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 _RAW = (".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f")
 _UNSUPPORTED = (*_RAW, ".avif", ".heic", ".heif", ".jp2", ".jxl")
 _LOSSY = ("JPEG", "MPO", "WEBP")
+_COPY_SUFFIXES = (".jpg", ".png")
+"""Suffixes of copies that are not equal to their photo."""
 
 _MIN_SHARPNESS = 0.12
 """Minimum sharpness as a fraction of the median of all photos.
@@ -103,16 +105,18 @@ def find_photos(folder: Path, *, masks: Path | None = None) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: must be an existing folder of photographs, or a video")
-    found: dict[str, Path] = {}
+    found, copies = list[Path](), dict[str, Path]()
     for path in files_below(folder, skip=masks):
         name = path.relative_to(folder).as_posix()
         if path.suffix.lower() not in SUFFIXES + _UNSUPPORTED or not path.is_file() or "/." in f"/{name}":
             continue
         check_path_encoding(path)
-        other = found.setdefault(stored_name(name, path.suffix.lower()), path)
-        if other != path:
-            raise InputError(f"{path}: its copy would have the same name as that of {other}: rename one of them")
-    return list(found.values())
+        for suffix in {path.suffix.lower(), *_COPY_SUFFIXES}:
+            other = copies.setdefault(stored_name(name, suffix), path)
+            if other != path:
+                raise InputError(f"{path}: its copy would have the same name as that of {other}: rename one of them")
+        found.append(path)
+    return found
 
 
 def prepare_photos(

@@ -148,9 +148,10 @@ def test_photos_are_found_through_links_and_masks_are_ignored(folder: Path) -> N
     assert [path.relative_to(folder).as_posix() for path in found] == ["0.png", "1.png", "2.png", "linked/7.PNG"]
 
 
-def test_photos_whose_copies_would_have_the_same_name_are_refused(folder: Path) -> None:
+@pytest.mark.parametrize("names", [("a/b.png", "a__b.png"), ("c.tif", "c.tif.png"), ("c.webp", "c.webp.jpg")])
+def test_photos_whose_copies_would_have_the_same_name_are_refused(folder: Path, names: tuple[str, str]) -> None:
     (folder / "a").mkdir()
-    for name in ("a/b.png", "a__b.png"):
+    for name in names:
         Image.fromarray(texture(8)).save(folder / name)
     with pytest.raises(InputError, match=r"its copy would have the same name as that of .*: rename one of them"):
         prepare(folder)

@@ -19,6 +19,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from mitsplat.capture import known_poses as poses
 from mitsplat.capture import structure_from_motion as sfm
+from mitsplat.capture.boards import Board
 from mitsplat.capture.capture import Capture
 from mitsplat.capture.known_poses import read_poses
 from mitsplat.capture.nerf_transforms import parse_transforms, read_transforms
@@ -437,6 +438,21 @@ def test_the_model_decides_whether_its_cameras_hold_for_upright_photos(
         with Image.open(photo.file) as copy:
             np.testing.assert_array_equal(np.asarray(copy), wanted)
             assert copy.getexif().get(ExifTags.Base.Orientation, 1) == 1
+
+
+def test_a_second_capture_with_other_settings_turns_photos_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    upright, prepared = turned_photos(tmp_path, 6, (80, 60))
+    monkeypatch.setattr(poses, "read_colmap_model", lambda *_: model_of(upright))
+    (tmp_path / "model").mkdir()
+    for square in (0.02, 0.03):
+        settings = CaptureSettings("environment", poses=tmp_path / "model", metric=True, board=Board(square=square))
+        capture = capture_photos(tmp_path / "photos", tmp_path / "out", settings).capture
+        assert len(capture.photos) == len(prepared)
+        for photo in capture.photos:
+            with Image.open(photo.file) as picture:
+                np.testing.assert_array_equal(np.asarray(picture), upright)
 
 
 @pytest.mark.parametrize("points", [True, False])

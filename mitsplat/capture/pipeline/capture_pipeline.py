@@ -248,7 +248,8 @@ def _delete_outdated(out: Path, inputs: JsonObject, settings: CaptureSettings) -
         shutil.rmtree(out / "sfm", ignore_errors=True)
         shutil.rmtree(out / "images", ignore_errors=True)
         write_text(file, marker)
-    elif settings.undistorted:  # undistorted images of an earlier run may have the names of the copies
+    elif settings.undistorted or settings.poses is not None:
+        # Undistorted and turned images of an earlier run may have the names of the copies.
         shutil.rmtree(out / "images", ignore_errors=True)
     shutil.rmtree(out / "masks", ignore_errors=True)
 

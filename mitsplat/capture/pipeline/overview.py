@@ -21,7 +21,7 @@ _TINT = np.array([0.33, 0.0, 0.33], dtype=np.float32)
 def capture_sheet(capture: Capture) -> Image.Image:
     """Draw the overview picture of a capture, in RGB."""
     centres, ahead = optical_axes(photo.camera for photo in capture.photos)
-    reach = 1.1 * float(np.abs(centres).max())
+    reach = 1.1 * float(np.abs(centres).max()) or 1.0
     panels = []
     for axes, down in (((0, 1), 2), ((0, 2), 1)):
         order = np.argsort(capture.points[:, down] * (1 if down == 2 else -1))  # draws the nearest points last

@@ -346,7 +346,9 @@ def _input_hash(
 ) -> str:
     """Return the SHA-256 of all inputs of a fit."""
     digest = ContentHash(capture.content_hash)
-    digest.add_json([__version__, asdict(settings), type(densification).__name__])
+    fields = getattr(densification, "__dict__", {})
+    options = {name: value for name, value in fields.items() if isinstance(value, int | float | str)}
+    digest.add_json([__version__, asdict(settings), type(densification).__name__, options])
     if depths is not None:
         digest.add(depths.kind)
         for name, file in sorted(depths.files.items()):

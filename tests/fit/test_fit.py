@@ -128,6 +128,11 @@ def test_a_finished_fit_is_reused(fitted: Path, capture: Capture) -> None:
     assert again.iterations == 60 and again.psnr == json.loads((fitted / "fit.json").read_text())["psnr"]
 
 
+def test_a_strategy_with_other_parameters_is_another_fit(capture: Capture) -> None:
+    hashes = {fit._input_hash(capture, SMALL, None, Classic(most, every)) for most in (500, 800) for every in (50, 100)}
+    assert len(hashes) == 4
+
+
 @pytest.mark.parametrize("strategy", [Classic, pytest.param(None, marks=pytest.mark.extended)])
 def test_an_interrupted_fit_resumes_to_the_same_bytes(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: type[Classic] | None

@@ -23,9 +23,11 @@ from mitsplat.reconstruct.materials.capture_light import CaptureLight, require_l
 from mitsplat.reconstruct.materials.colour_fit import fit_colours
 from mitsplat.reconstruct.materials.estimation import MaterialEstimate, MaterialRegion, estimate_materials
 from mitsplat.reconstruct.materials.lit_surfaces import lit_surfaces
-from mitsplat.reconstruct.materials.observations import Observations, View
+from mitsplat.reconstruct.materials.observations import Observations, View, observe
+from mitsplat.reconstruct.materials.surface_light import LitMesh
 from mitsplat.reconstruct.pipeline import asset_pipeline as pipeline
 from mitsplat.reconstruct.reconstruct import AssetJob, Reconstruction, ReconstructSettings
+from mitsplat.runtime.variant import ensure_variant
 from mitsplat.scene.spec.light_spec import AreaLight, EnvironmentLight, LightDraw
 
 LIGHT = CaptureLight(
@@ -148,9 +150,27 @@ def test_the_table_outside_of_the_photos_reflects_light_on_the_object(photograph
 def test_errors_of_the_same_factor_do_not_make_colours_darker() -> None:
     """The logarithms of the observations of a point are uniform around that of its radiance."""
     radiance = np.tile(0.5 * np.exp(np.linspace(-0.25, 0.25, 20))[:, None], (1, 3))
-    seen = Observations(np.zeros(20, dtype=np.int64), radiance, np.tile([0.0, 0.0, 1.0], (20, 1)))
+    clipped = np.zeros(radiance.shape, dtype=bool)
+    seen = Observations(np.zeros(20, dtype=np.int64), radiance, np.tile([0.0, 0.0, 1.0], (20, 1)), clipped)
     fit = fit_colours(seen, (np.ones((20, 3)), np.zeros((20, 3))))
     np.testing.assert_allclose(fit.colours, 0.5, rtol=0.01)
+
+
+def test_white_of_a_photo_that_was_darkened_is_a_lower_bound(tmp_path: Path) -> None:
+    """A photo with twice the exposure shows white; its correction halves the values, also those of white."""
+    sheet = trimesh.creation.box((0.2, 0.2, 0.01))
+    Image.new("RGB", (80, 60), "white").save(tmp_path / "a.png")
+    Image.new("L", (80, 60), 255).save(tmp_path / "mask.png")
+    camera = Camera.look_at((0, 0, 0.2), (0, 0, 0), width=80, height=60, fov_x=40)
+    photo = Photo("a.png", tmp_path / "a.png", camera, tmp_path / "mask.png", gain=(0.5, 0.5, 1.0))
+    ensure_variant()
+    surfaces = LitMesh(sheet, len(sheet.faces), LIGHT.scene(), [0.0, 0.0, 0.0])
+    top = np.array([[0.0, 0.0, 0.005]])
+    seen = observe(surfaces, top, np.array([[0.0, 0.0, 1.0]]), [View.of(photo, 80)], "object")
+    assert seen.clipped.all() and len(seen.radiance) == 1
+    np.testing.assert_allclose(seen.radiance, [[0.5, 0.5, 1.0]], atol=1e-3)
+    fit = fit_colours(seen, (np.full((1, 3), 0.8), np.zeros((1, 3))), np.ones(3))
+    assert fit.errors[0] == pytest.approx(np.log1p((0.2 / 0.1) ** 2) / 3, rel=0.3)  # only blue is too dark
 
 
 def estimate(confidence: float, explained: float = 0.5) -> MaterialEstimate:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mitsplat.arrays import Float32Array, Float64Array
-from mitsplat.reconstruct.materials.observations import CLIPPED, Observations
+from mitsplat.reconstruct.materials.observations import Observations
 from mitsplat.reconstruct.materials.surface_light import Reflectance
 
 _ROUNDS = 4
@@ -46,9 +46,8 @@ def fit_colours(
     tint, white = material
     starts = np.flatnonzero(np.diff(seen.point, prepend=-1))
     counts = np.diff(starts, append=len(seen.point))
-    clipped = seen.radiance >= CLIPPED
     scale = _NOISE[0] * seen.radiance + _NOISE[1]
-    weight = ~clipped / scale**2
+    weight = ~seen.clipped / scale**2
     for _ in range(_ROUNDS if colour is None else 1):
         sums = np.add.reduceat(weight * tint**2, starts)
         colours = np.clip(np.add.reduceat(weight * tint * (seen.radiance - white), starts) / (sums + 1e-9), 0, 1)
@@ -60,7 +59,7 @@ def fit_colours(
         # observation, dark ones would have more weight, and colours would be too dark.
         predicted_scale = _NOISE[0] * predicted + _NOISE[1]
         # A clipped pixel limits the radiance from below only.
-        free = clipped & (excess > 0)
+        free = seen.clipped & (excess > 0)
         square = np.where(free, 0, excess**2 / (scale * predicted_scale))
         weight = ~free * (scale + predicted_scale) / (2 * scale * predicted_scale**2 * (1 + square))
     errors = np.add.reduceat(np.log1p(square).mean(axis=1), starts) / counts

@@ -77,7 +77,8 @@ def _support_radiance(
     light = surfaces.light(points, upward)
     traced = surfaces.reflectance(light, seen.point, seen.to_camera, _ROUGHNESS)
     # Clipped pixels count as just below the limit, because a support that is clipped everywhere must not become black.
-    observed = Observations(row, np.minimum(seen.radiance, 0.999 * CLIPPED), seen.to_camera)
+    radiance = np.minimum(seen.radiance, 0.999 * CLIPPED)
+    observed = Observations(row, radiance, seen.to_camera, np.zeros_like(seen.clipped))
     fits = [fit_colours(observed, mix_materials(traced, 0.0, k)) for k in range(len(_ROUGHNESS))]
     best = int(np.argmin([fit.errors.mean() for fit in fits]))
     nearest = KDTree(points[known]).query(points, k=min(_OUTER, len(known)))[1].reshape(len(points), -1)
@@ -92,9 +93,8 @@ def _support_radiance(
     tint, white = mix_materials(traced, 0.0, 0)
     radiance = colours[point] * tint + white
     # Photographs contain the light that the object reflects onto the support, and the model the grazing angles.
-    everything = (
-        np.concatenate(pair) for pair in ((seen.point, point), (seen.radiance, radiance), (seen.to_camera, towards))
-    )
+    modelled = Observations(point, radiance, towards, np.zeros(radiance.shape, dtype=bool))
+    everything = (np.concatenate(pair) for pair in zip(seen, modelled, strict=True))
     return _linear_radiance(points, Observations(*everything).in_order())
 
 

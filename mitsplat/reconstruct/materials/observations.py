@@ -21,7 +21,7 @@ from mitsplat.reconstruct.materials.surface_light import LitMesh
 _MIN_COSINE = 0.2
 """Least cosine between normal and camera of an observation."""
 CLIPPED = 0.97
-"""Linear radiance from which a pixel may be clipped."""
+"""Linear radiance from which a pixel may be clipped, as a share of that of white."""
 _MIN_OPENNESS, _MIN_FLATNESS = 0.9, 0.97
 """Limits of clear points: share of the hemisphere without the object, and mean cosine of the normals in two pixels."""
 
@@ -34,12 +34,14 @@ class View(NamedTuple):
         radiance: Linear radiance, (H, W, 3).
         object: True for pixels that show only the object, (H, W).
         surroundings: True for known pixels that show only other objects, (H, W).
+        white: Largest radiance that the photo can show, which depends on its exposure correction, shape (3,).
     """
 
     camera: Camera
     radiance: Float32Array
     object: BoolArray
     surroundings: BoolArray
+    white: Float32Array
 
     @classmethod
     def of(cls, photo: Photo, size: int) -> View:
@@ -48,7 +50,8 @@ class View(NamedTuple):
         known = known_where(hidden, camera)
         inside = np.zeros(known.shape, dtype=bool) if mask is None else mask > 0.5
         outside = known & ~binary_dilation(inside, iterations=2)
-        return cls(camera, decode_srgb(rgb).astype(np.float32), known & binary_erosion(inside), outside)
+        white = np.minimum(photo.gain or np.ones(3), 1).astype(np.float32)
+        return cls(camera, decode_srgb(rgb).astype(np.float32), known & binary_erosion(inside), outside, white)
 
 
 class Observations(NamedTuple):
@@ -56,23 +59,29 @@ class Observations(NamedTuple):
 
     Attributes:
         point: Index of the point, (R,).
-        radiance: Linear radiance, at least 1 if a pixel may be clipped, (R, 3).
+        radiance: Linear radiance, (R, 3).
         to_camera: Unit vectors towards the camera, (R, 3).
+        clipped: True where the radiance is only a lower bound, (R, 3).
     """
 
     point: Int64Array
     radiance: Float64Array
     to_camera: Float64Array
+    clipped: BoolArray
 
     def in_order(self) -> Observations:
         """Return the observations sorted by point."""
         order = np.argsort(self.point, kind="stable")
-        return Observations(self.point[order], self.radiance[order], self.to_camera[order])
+        return Observations(self.point[order], *self._at(order))
 
     def select(self, points: Int64Array) -> tuple[Observations, BoolArray]:
         """Return the observations of sorted ``points``, renumbered, and the mask (R,) of these observations."""
         rows = np.isin(self.point, points)
-        return Observations(np.searchsorted(points, self.point[rows]), self.radiance[rows], self.to_camera[rows]), rows
+        return Observations(np.searchsorted(points, self.point[rows]), *self._at(rows)), rows
+
+    def _at(self, rows: BoolArray | Int64Array) -> tuple[Float64Array, Float64Array, BoolArray]:
+        """Return radiance, directions and clipping of some observations."""
+        return self.radiance[rows], self.to_camera[rows], self.clipped[rows]
 
 
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int = 0) -> tuple[Float64Array, Float64Array]:
@@ -103,13 +112,13 @@ def observe(
             continue
         x, y = (pixels[rows].T[..., None] - 0.5).astype(np.float32)
         radiance = np.asarray(cv2.remap(view.radiance, x, y, cv2.INTER_LINEAR))[:, 0]
-        bright = cv2.dilate((view.radiance >= CLIPPED).astype(np.float32), np.ones((3, 3)))
+        bright = cv2.dilate((view.radiance >= CLIPPED * view.white).astype(np.float32), np.ones((3, 3)))
         clipped = np.asarray(cv2.remap(np.asarray(bright), x, y, cv2.INTER_NEAREST))[:, 0] > 0
-        found.append((rows, np.where(clipped, np.maximum(radiance, 1), radiance), to_camera[rows]))
+        radiance = np.where(clipped, np.maximum(radiance, view.white), radiance)
+        found.append((rows, radiance.astype(np.float64), to_camera[rows], clipped))
     if not found:
-        return Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
-    point, radiance, to_camera = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return Observations(point, radiance.astype(np.float64), to_camera).in_order()
+        return Observations(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), bool))
+    return Observations(*(np.concatenate(parts) for parts in zip(*found, strict=True))).in_order()
 
 
 def clear_points(

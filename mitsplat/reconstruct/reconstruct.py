@@ -17,7 +17,7 @@ from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
 from mitsplat.geometry.decomposition import convex_pieces
-from mitsplat.geometry.rigid import scaling
+from mitsplat.geometry.rigid import scaling, split_similarity
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.asset_evaluation import HeldOutView, Verdict, compute_verdict, show_held_out
 from mitsplat.reconstruct.causes import find_causes
@@ -267,10 +267,13 @@ def _in_metres(asset: Asset, job: AssetJob, alignment: Alignment | None) -> tupl
         turn = _alignment_rotation(asset.mesh)
         asset = asset.transformed(turn)
         return asset.resized(size), scaling(asset.factor_to(size)) @ turn
-    if asset.units == "unknown" and alignment is not None and imported is not None and imported.metres_per_unit:
-        metres = imported.metres_per_unit / alignment.scale
-        return replace(asset.scaled(metres), units="metre"), scaling(metres)
-    return asset, np.eye(4)
+    if asset.units == "metre" or imported is None or imported.metres_per_unit is None:
+        return asset, np.eye(4)
+    capture_from_mesh = imported.capture_from_mesh if alignment is None else alignment.splats_from_mesh
+    if capture_from_mesh is None:
+        return asset, np.eye(4)
+    metres = imported.metres_per_unit / split_similarity(capture_from_mesh)[1]
+    return replace(asset.scaled(metres), units="metre"), scaling(metres)
 
 
 def _alignment_rotation(mesh: trimesh.Trimesh) -> Float64Array:

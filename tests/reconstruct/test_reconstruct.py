@@ -217,6 +217,17 @@ def test_a_drawing_determines_the_scale_of_a_capture(known_object: KnownObject) 
     assert found.verdict.offset < 0.003
 
 
+def test_a_placed_mesh_of_known_unit_determines_the_scale_of_a_capture(known_object: KnownObject) -> None:
+    capture_from_mesh = np.diag([1e-4, 1e-4, 1e-4, 1.0])
+    capture = replace(known_object.capture.transformed(np.diag([0.1, 0.1, 0.1, 1.0])), units="unknown")
+    imported = ImportedMesh(known_object.mesh.copy().apply_scale(1e3), capture_from_mesh, metres_per_unit=1e-3)
+    job = AssetJob(name="part", settings=SETTINGS, imported=imported)
+    found = reconstruct_asset(capture, known_object.splats.transformed(np.diag([0.1, 0.1, 0.1, 1.0])), job)
+    assert found.asset.units == "metre" and found.asset.mesh is not None
+    assert found.asset.mesh.scale == pytest.approx(known_object.mesh.scale, rel=1e-3)
+    np.testing.assert_allclose(found.asset_from_capture, np.diag([10.0, 10, 10, 1]))
+
+
 @pytest.mark.parametrize(("height", "lowest"), [(0.049, 0.0), pytest.param(0.0, -0.05, marks=pytest.mark.extended)])
 def test_an_object_is_cut_at_the_table_below_it(known_object: KnownObject, height: float, lowest: float) -> None:
     """Gaussians 1 mm below the table are removed; a plane through the middle of an object is not its support."""

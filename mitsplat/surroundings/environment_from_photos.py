@@ -118,6 +118,8 @@ def reconstruct_environment(
         place = _PhotographedPlace.of(place.capture, splats, scale, place.supports)
     background = _background(place)
     imported = job.imported or ImportedMesh(_mesh(place, ~background, job, progress), np.eye(4))
+    if job.imported is not None and job.imported.capture_from_mesh is not None:
+        imported = replace(job.imported, capture_from_mesh=motion @ job.imported.capture_from_mesh)
     made = reconstruct_asset(
         place.capture, place.splats, replace(job, imported=imported, remove=()), psnr=psnr, progress=progress
     )

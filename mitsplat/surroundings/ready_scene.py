@@ -56,7 +56,7 @@ def scene_text(name: str, supports: Sequence[Support], free: Rectangle, cameras:
         for number, s in enumerate(supports)
     )
     return _SCENE.format(
-        name=name, folder=_FOLDER, boxes=boxes, x0=_length(x0), x1=_length(x1), y0=_length(y0), y1=_length(y1),
+        name=_quoted(name), folder=_FOLDER, boxes=boxes, x0=_length(x0), x1=_length(x1), y0=_length(y0), y1=_length(y1),
         margin=_length(margin), tx=_length(target[0]), ty=_length(target[1]), near=_length(near), far=_length(far),
         low=f"{low:.0f}", high=f"{high:.0f}", start=f"{start:.0f}", end=f"{end:.0f}", fov=f"{min(fov, 120):.0f}",
     )  # fmt: skip
@@ -83,6 +83,11 @@ def _surface_name(number: int) -> str:
     return "support" if number == 0 else f"surface{number}"
 
 
+def _quoted(text: str) -> str:
+    """Return a text as a scalar of YAML, which may look like a number or contain a comment sign."""
+    return json.dumps(text, ensure_ascii=False)
+
+
 def _length(length: float) -> str:
     """Format a length to a tenth of a millimetre."""
     return f"{round(float(length), 4) + 0.0:g}"
@@ -94,7 +99,7 @@ def recorded_scene(out: Path) -> str | None:
         scene = json.loads((out / VERDICT_FILE).read_text()).get("scene")
     except (OSError, ValueError, AttributeError):
         return None
-    return scene.replace(_FOLDER, out.resolve().name) if isinstance(scene, str) else None
+    return scene.replace(_FOLDER, _quoted(out.resolve().name)) if isinstance(scene, str) else None
 
 
 def write_recorded_scene(out: Path, earlier: str | None) -> tuple[Path | None, str | None]:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
+from ruamel.yaml import YAML
 
 from mitsplat.arrays import Float64Array
 from mitsplat.asset import Asset
@@ -16,16 +18,18 @@ from mitsplat.capture.capture import Capture, Photo
 from mitsplat.checks.path_checks import check_scene
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.rigid import homogeneous_matrix
 from mitsplat.reconstruct.asset_evaluation import show_asset
 from mitsplat.reconstruct.pipeline.asset_pipeline import AssetResult, make_asset
-from mitsplat.reconstruct.reconstruct import AssetJob, ReconstructSettings
+from mitsplat.reconstruct.reconstruct import AssetJob, ImportedMesh, ReconstructSettings
 from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.surroundings.coverage import MIN_PHOTOS, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.environment_from_photos import reconstruct_environment
 from mitsplat.surroundings.floaters import find_unsupported, remove_floaters
-from mitsplat.surroundings.supports import find_supports, fit_plane
+from mitsplat.surroundings.ready_scene import scene_text, write_recorded_scene
+from mitsplat.surroundings.supports import Support, find_supports, fit_plane
 
 TABLE, HEIGHT = (1.2, 0.7), 0.11
 """Size and height of the table [m]; its centre is above the origin, and the floor is 0.8 m below it."""
@@ -227,6 +231,18 @@ def test_an_unknown_vertical_is_that_of_the_table(splats: Splats, captured: Capt
     assert any("the scale is unknown" in sentence for sentence in found.verdict.misses())
 
 
+def test_an_imported_mesh_stays_on_the_table_of_its_capture(splats: Splats, captured: Capture) -> None:
+    """Its given transform refers to the capture, whose origin is 11 cm from the table."""
+    table = trimesh.creation.box((*TABLE, 0.02)).apply_translation((0, 0, HEIGHT - 0.01))
+    capture_from_mesh = homogeneous_matrix(2 * np.eye(3), (1.0, 2.0, 3.0))
+    drawing = table.copy().apply_transform(np.linalg.inv(capture_from_mesh))
+    job = AssetJob("cell", kind="environment", settings=SMALL, imported=ImportedMesh(drawing, capture_from_mesh))
+    found = reconstruct_environment(captured, splats, job)
+    assert found.asset.mesh is not None
+    expected = table.copy().apply_transform(found.asset_from_capture).bounds
+    np.testing.assert_allclose(found.asset.mesh.bounds, expected, atol=1e-6)
+
+
 def test_the_scene_of_surroundings_drops_objects_beside_the_box(made: tuple[Path, AssetResult]) -> None:
     folder, done = made
     assert done.scene == folder / "cell.yaml"
@@ -234,6 +250,19 @@ def test_the_scene_of_surroundings_drops_objects_beside_the_box(made: tuple[Path
     assert scene.spec.region.max[0] < TABLE[0] / 2 and scene.spec.region.min[0] > -TABLE[0] / 2
     corner = np.array([TABLE[0] / 2 - BOX[0], TABLE[1] / 2 - BOX[1]])
     assert (np.array(scene.spec.region.max[:2]) < corner).any()
+
+
+@pytest.mark.parametrize("name", ["cell #2", "true", "007", "a: b"])
+def test_names_of_any_text_stay_text_in_the_scene(tmp_path: Path, name: str) -> None:
+    """YAML reads them as a comment, a truth value, a number or a mapping if they are not quoted."""
+    support = Support(np.eye(4), (1.0, 0.8), 1e-3, 0.0, 0.9, 0.9)
+    text = scene_text(name, [support], (-0.3, 0.3, -0.2, 0.2), cameras())
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "verdict.json").write_text(json.dumps({"scene": text}))
+    file, warning = write_recorded_scene(tmp_path / name, None)
+    assert file is not None and warning is None
+    scene = YAML(typ="safe").load(file)
+    assert (scene["name"], scene["environment"]) == (name, name)
 
 
 @pytest.mark.extended

@@ -221,7 +221,8 @@ def _prepare(
             return "it is transparent"
     prepared = Prepared(name, file, rgb.size, orientation, tuple(map(str, lens)), pending, opaque)
     plain = None if upright else plain_background(np.asarray(rgb))
-    return _measure(prepared, np.asarray(rgb.convert("L")), shown, plain, read_mask(masks, prepared))
+    mask = read_mask(masks, prepared) if pending == 1 else None  # the model decides on the orientation of the mask
+    return _measure(prepared, np.asarray(rgb.convert("L")), shown, plain, mask)
 
 
 def _measure(
@@ -335,7 +336,7 @@ def turn_upright(photo: Prepared) -> Prepared:
     """Return the photo with its pending EXIF orientation applied, in a new copy; an existing copy is reused."""
     if photo.pending == 1:
         return photo
-    file = photo.file.with_name(f"{photo.file.stem}.upright.png")
+    file = photo.file.with_name(f"{photo.file.name}.upright.png")
     try:
         with Image.open(photo.file) as image:
             turned = ImageOps.exif_transpose(with_orientation(eight_bit(image), photo.pending))

@@ -455,6 +455,20 @@ def test_a_second_capture_with_other_settings_turns_photos_once(
                 np.testing.assert_array_equal(np.asarray(picture), upright)
 
 
+def test_masks_of_photos_that_the_model_turns_are_upright(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    upright, prepared = turned_photos(tmp_path, 6, (80, 60))
+    monkeypatch.setattr(poses, "read_colmap_model", lambda *_: model_of(upright))
+    mask = np.zeros(upright.shape[:2], dtype=np.uint8)
+    mask[10:30, 20:50] = 255
+    for name in ("model", "masks"):
+        (tmp_path / name).mkdir()
+    for photo in prepared:
+        Image.fromarray(mask).save(tmp_path / "masks" / photo.name)
+    settings = CaptureSettings(poses=tmp_path / "model", metric=True, masks=tmp_path / "masks")
+    for photo in capture_photos(tmp_path / "photos", tmp_path / "out", settings).capture.photos:
+        np.testing.assert_array_equal(photo.read_mask()[0], mask / np.float32(255))
+
+
 @pytest.mark.parametrize("points", [True, False])
 def test_an_undecided_half_turn_is_refused_with_a_remedy(
     tmp_path: Path, points: bool, monkeypatch: pytest.MonkeyPatch

@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 
 from mitsplat.capture import structure_from_motion
 from mitsplat.capture.capture import Photo
-from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, undistort
+from mitsplat.capture.photos import Prepared, find_photos, prepare_photos, turn_upright, undistort
 from mitsplat.capture.structure_from_motion import SparseModel, lens_groups
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
@@ -155,6 +155,14 @@ def test_photos_whose_copies_would_have_the_same_name_are_refused(folder: Path, 
         Image.fromarray(texture(8)).save(folder / name)
     with pytest.raises(InputError, match=r"its copy would have the same name as that of .*: rename one of them"):
         prepare(folder)
+
+
+def test_upright_copies_of_photos_that_differ_in_their_suffix_differ(tmp_path: Path) -> None:
+    for number, name in enumerate(("a.png", "a.bmp")):
+        Image.fromarray(texture(number)).save(tmp_path / name)
+    photos = [Prepared(name, tmp_path / name, (80, 60), 1, (), pending=6) for name in ("a.png", "a.bmp")]
+    pictures = [np.asarray(Image.open(turn_upright(photo).file)) for photo in photos]
+    assert not np.array_equal(*pictures)
 
 
 def test_a_single_photo_is_refused_as_a_folder(folder: Path) -> None:

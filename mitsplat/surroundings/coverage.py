@@ -109,8 +109,10 @@ def find_coverage(support: Support, views: Sequence[DepthView], points: SurfaceP
     flat = empty.cell_centres(np.argwhere(np.ones(shape)))
     world = _to_scene(support, flat)
     for view in views:
-        depth, surface = view.depths_at(world)
         height = float((view.camera.centre - support.pose[:3, 3]) @ support.pose[:3, 2])
+        if height <= 0:  # it shows the lower side, at the same depth if the support is thin
+            continue
+        depth, surface = view.depths_at(world)
         # Height above the support of the surface point that the ray to a cell hits.
         above = height * (1 - surface / depth)
         photos += (np.abs(above) < SUPPORT_TOLERANCE * scale).reshape(shape)

@@ -124,12 +124,13 @@ class Grid:
     def bare_colours(self, splats: Splats, cameras: Sequence[Camera], height: float) -> tuple[Float64Array, BoolArray]:
         """Return display-encoded colours (X, Y, 3) of the bare support, and True for cells with enough bare views.
 
-        Cameras with near and steep views have larger weights.
+        Cameras with near and steep views have larger weights. Cameras below the support show its lower side, and are
+        left out.
         """
         shape = self.middles.shape[:2]
         places = np.concatenate([self.middles, np.zeros((*shape, 1))], axis=2).reshape(-1, 3)
         colours, weights, count = np.zeros((*shape, 3)), np.full(shape, 1e-12), np.zeros(shape, dtype=np.int64)
-        for camera in cameras:
+        for camera in (camera for camera in cameras if camera.centre[2] > 0):
             view, shown = _render_view(splats, camera)
             depth, surface = view.depths_at(places)
             bare = np.abs(view.camera.centre[2] * (1 - surface / depth)) < height  # False for NaN

@@ -126,8 +126,9 @@ def remove_objects(
         for place, wall in enumerate(walls, len(supports)):
             if _is_close_to_wall(own, wall, scale):
                 splats, area, copied = _fill_behind(splats, own, places, ground(place), scale)
-                share = (body.copied * body.filled_area + copied * area) / (body.filled_area + area)
-                body = replace(body, behind=body.behind + area, copied=share)
+                if area > 0:
+                    share = (body.copied * body.filled_area + copied * area) / (body.filled_area + area)
+                    body = replace(body, behind=body.behind + area, copied=share)
         removed.append(body)
         if progress is not None:
             progress(len(removed), len(picks), "removing objects")

@@ -28,6 +28,7 @@ from mitsplat.surroundings.coverage import MIN_PHOTOS, find_coverage, find_holes
 from mitsplat.surroundings.depth_views import depth_views, surface_points
 from mitsplat.surroundings.environment_from_photos import reconstruct_environment
 from mitsplat.surroundings.floaters import find_unsupported, remove_floaters
+from mitsplat.surroundings.ground import Grid
 from mitsplat.surroundings.ready_scene import scene_text, write_recorded_scene
 from mitsplat.surroundings.supports import Support, find_supports, fit_plane
 
@@ -153,6 +154,23 @@ def test_coverage_marks_occupied_and_unseen_parts_of_the_table(splats: Splats) -
     )
     (hole,) = find_holes(table, gap, splats, named)
     assert hole.area == pytest.approx(behind.sum() * coverage.cell.prod()) and hole.visible_share > 0.9
+
+
+def test_cameras_below_a_thin_support_do_not_show_its_top() -> None:
+    board = sheet((0.6, 0.4), 0.01, 1)
+    support = Support(np.eye(4), (0.6, 0.4), 1e-3, 0.0, 0.9, 0.9)
+    eyes = [(0.8 * np.cos(turn), 0.8 * np.sin(turn), 0.5) for turn in np.linspace(0, 5, 4)]
+    above = [Camera.look_at(eye, (0, 0, 0), width=160, height=120, fov_x=60) for eye in eyes]
+    below = [Camera.look_at(np.array(eye) * (1, 1, -1), (0, 0, 0), width=160, height=120, fov_x=60) for eye in eyes]
+    points = surface_points(depth_views(board, above))
+    assert find_coverage(support, depth_views(board, below), points, 1.0).photos.max() == 0
+    grid = Grid.of(support, 0.02)
+    colours, seen = grid.bare_colours(board, above, 0.003)
+    also_below, still_seen = grid.bare_colours(board, above + below, 0.003)
+    assert seen.mean() > 0.9
+    np.testing.assert_array_equal(also_below, colours)
+    np.testing.assert_array_equal(still_seen, seen)
+    assert not grid.bare_colours(board, below, 0.003)[1].any()
 
 
 def test_the_largest_free_rectangle_agrees_with_a_full_search() -> None:

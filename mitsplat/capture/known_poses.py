@@ -115,7 +115,8 @@ def _read_model(
             _logger.warning("%s: %s", source, remark)
         paths = _frame_paths(source, content)
         names = match_names(source, paths, base, everything)
-        sizes = {name: by_name[photo].size for name, photo in names.items() if photo in by_name}
+        own = {name: by_name[photo] for name, photo in names.items() if photo in by_name}
+        sizes = {name: photo.full_size or photo.size for name, photo in own.items()}
         model, sized = read_transforms(source, content, sizes)
     else:
         refuse_calibration(source, POSES_RULE)

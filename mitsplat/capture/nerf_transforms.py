@@ -156,7 +156,7 @@ def read_transforms(
 ) -> tuple[SparseModel, set[str]]:
     """Return the cameras of a ``transforms.json`` by its file paths, and the paths for which it states the size.
 
-    Frames without a size have that of their photo in ``sizes``, and are left out if they have none.
+    Frames without a size have that of their photo in ``sizes`` [px], and are left out if they have none.
     """
     cameras: dict[str, Camera] = {}
     sized = set()

@@ -72,6 +72,7 @@ class Prepared:
         lens: Width and height, and the camera make, model and focal length that the EXIF data state.
         pending: EXIF orientation that was not applied, 1 to 8 (1: none).
         opaque: Fraction of opaque pixels; None without an alpha channel.
+        full_size: Width and height of the photo before it was reduced [px]; None if it was not.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Prepared:
     lens: tuple[str, ...]
     pending: int = 1
     opaque: float | None = None
+    full_size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -202,8 +204,9 @@ def _prepare(
     kept &= is_srgb and max(turned.size) <= max_size and orientation == pending == 1
     suffix = path.suffix if kept else ".jpg" if lossy else ".png"
     file = out / stored_name(name, suffix)
-    rgb = eight_bit(turned)
+    rgb, full_size = eight_bit(turned), None
     if max(rgb.size) > max_size:
+        full_size = rgb.size
         rgb.thumbnail((max_size, max_size), Image.Resampling.LANCZOS)
     if kept and not file.exists():
         copy_file(path, file)
@@ -219,7 +222,7 @@ def _prepare(
         opaque = float(shown.mean())
         if not opaque:
             return "it is transparent"
-    prepared = Prepared(name, file, rgb.size, orientation, tuple(map(str, lens)), pending, opaque)
+    prepared = Prepared(name, file, rgb.size, orientation, tuple(map(str, lens)), pending, opaque, full_size)
     plain = None if upright else plain_background(np.asarray(rgb))
     mask = read_mask(masks, prepared) if pending == 1 else None  # the model decides on the orientation of the mask
     return _measure(prepared, np.asarray(rgb.convert("L")), shown, plain, mask)

@@ -389,6 +389,25 @@ def test_paths_of_a_transforms_json_are_relative_to_it(tmp_path: Path) -> None:
         read_transforms(path, parse_transforms(path), {})
 
 
+@pytest.mark.parametrize("centre", [{}, {"cx": 42.0, "cy": 30.0}])
+def test_intrinsics_without_a_size_are_those_of_the_photo_before_it_is_reduced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, centre: dict[str, float]
+) -> None:
+    frames = []
+    (tmp_path / "photos").mkdir()
+    for number, name in enumerate(("a.png", "b.png", "c.png")):
+        noise = np.random.default_rng(number).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / "photos" / name)
+        frames.append({"file_path": name, "transform_matrix": np.eye(4).tolist()})
+    source = tmp_path / "photos/transforms.json"
+    source.write_text(json.dumps({"fl_x": 100.0, **centre, "frames": frames}))
+    photos, _ = prepare_photos(tmp_path / "photos", tmp_path / "copies", max_size=40, upright=False)
+    monkeypatch.setattr(poses, "find_points", lambda photos, cameras, *_: cameras)
+    cameras, _ = read_poses(source, photos, tmp_path / "work", base=tmp_path / "photos")
+    for camera in cameras.values():
+        assert (camera.size, camera.fx, camera.cx) == ((40, 30), 50.0, 0.5 * centre.get("cx", 40.0))
+
+
 def turned_photos(folder: Path, orientation: int, size: tuple[int, int]) -> tuple[np.ndarray, list[Prepared]]:
     """Return the upright pixels of a photo, and three photos that are stored for an EXIF orientation."""
     coarse = np.random.default_rng(0).integers(0, 256, (size[1] // 4, size[0] // 4, 3), dtype=np.uint8)

@@ -222,14 +222,17 @@ def _level_place(capture: Capture, splats: Splats, scale: float) -> tuple[_Photo
     if not found:
         return place, np.eye(4)
     motion = np.asarray(np.linalg.inv(found[0].pose))
-    points = place.points.transformed(motion)
+    supports = find_supports(place.points.transformed(motion), _UP, scale, within=_MAX_LEVEL_TILT)
+    if supports:  # its frame differs from that of the first search, by a quarter turn if it is square
+        change = np.asarray(np.linalg.inv(supports[0].pose))
+        motion, supports = change @ motion, [support.transformed(change) for support in supports]
     level = _PhotographedPlace(
         capture=replace(capture.transformed(motion), up="z", table=True),
         splats=splats.transformed(motion),
         views=[view.transformed(motion) for view in place.views],
-        points=points,
+        points=place.points.transformed(motion),
         scale=scale,
-        supports=find_supports(points, _UP, scale, within=_MAX_LEVEL_TILT),
+        supports=supports,
     )
     return level, motion
 

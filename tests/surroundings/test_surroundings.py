@@ -26,7 +26,7 @@ from mitsplat.reconstruct.surface import SurfaceSettings
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.surroundings.coverage import MIN_PHOTOS, find_coverage, find_holes, free_rectangle
 from mitsplat.surroundings.depth_views import depth_views, surface_points
-from mitsplat.surroundings.environment_from_photos import reconstruct_environment
+from mitsplat.surroundings.environment_from_photos import _level_place, reconstruct_environment
 from mitsplat.surroundings.floaters import find_unsupported, remove_floaters
 from mitsplat.surroundings.ground import Grid
 from mitsplat.surroundings.ready_scene import scene_text, write_recorded_scene
@@ -236,6 +236,20 @@ def test_the_table_of_the_asset_lies_at_height_0(made: tuple[Path, AssetResult])
     assert done.verdict.psnr is not None and done.verdict.psnr > 35  # its own renderings, not the fit's report
     assert "Removed objects" not in done.verdict.rows
     assert "Support" in done.verdict.rows and "Support" in (folder / "cell" / "report.html").read_text()
+
+
+def test_the_frame_of_a_square_table_is_that_of_its_support() -> None:
+    """Either side of a square can be found as the longer one, and the second search found another one."""
+    table = sheet((0.8, 0.8), 0.02, 1)
+    eyes = [0.9 * np.array([np.cos(turn), np.sin(turn), 1.0]) for turn in np.arange(0.1, 6, 0.7)]
+    shown = [Camera.look_at(eye, (0, 0, 0), width=160, height=120, fov_x=65) for eye in eyes]
+    photos = tuple(Photo(f"{number}.png", Path("none.png"), camera) for number, camera in enumerate(shown))
+    capture = Capture(photos, np.zeros((0, 3)), np.zeros((0, 3)), units="metre", up="z")
+    for turn in (0.0, 0.5, 1.3):
+        motion = trimesh.transformations.rotation_matrix(turn, (0, 0, 1))
+        place, found = _level_place(capture.transformed(motion), table.transformed(motion), 1.2)
+        np.testing.assert_allclose(place.supports[0].pose, np.eye(4), atol=1e-6)
+        np.testing.assert_allclose(place.capture.photos[3].camera.centre, (found @ motion @ [*eyes[3], 1])[:3])
 
 
 def test_an_unknown_vertical_is_that_of_the_table(splats: Splats, captured: Capture) -> None:

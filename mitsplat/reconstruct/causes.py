@@ -121,7 +121,7 @@ def missing_views(offsets: Float64Array) -> list[str]:
     found = []
     for low, high in _ELEVATION_BANDS:
         where = f"{low:.0f} to {high:.0f} degrees above the object"
-        inside = (heights >= low) & (heights < high)
+        inside = (heights >= low) & ((heights < high) | (high == _ELEVATION_BANDS[-1][1]))
         if not inside.any():
             found.append(where)
             continue

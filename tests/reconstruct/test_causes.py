@@ -23,7 +23,8 @@ ALL_AROUND = np.arange(5, 360, 15)
 
 
 def test_views_from_all_heights_and_sides_give_no_advice():
-    assert missing_views(np.concatenate([ring(h, ALL_AROUND) for h in (10, 30)] + [ring(60, [0])])) == []
+    for above in (ring(60, [0]), np.array([[0.0, 0, 1]])):
+        assert missing_views(np.concatenate([*(ring(h, ALL_AROUND) for h in (10, 30)), above])) == []
 
 
 def test_a_missing_height_of_views_is_named():

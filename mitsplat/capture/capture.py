@@ -41,7 +41,6 @@ HELD_OUT_EVERY = 8
 CAPTURE_FILE = "capture.json"
 _POINTS = "points.npz"
 
-
 Window = tuple[int, int, int, int]
 """Rectangle in a photo: left, top, width and height [px]."""
 

@@ -129,13 +129,12 @@ def agreed_masks(
         camera, bgr, _ = _reduce_photo(photo, 1 if rough is None else _extent_share(rough))
         unknown = _resize_occlusion(hidden.get(photo.name), camera)
         silhouette = _silhouette(hull, cell, camera)
-        size = float(np.sqrt(np.count_nonzero(silhouette)))
-        if not size > 0:
+        band = _BAND * float(np.sqrt(np.count_nonzero(silhouette)))
+        if not band > 0:
             return np.zeros((photo.camera.height, photo.camera.width), dtype=bool)
-        near = _dilate(silhouette, _BAND * size)
-        core = ~_dilate(~silhouette, _BAND * size)
+        near, core = _dilate(silhouette, band), ~_dilate(~silhouette, band)
         free = _background_pixels(bare, camera, bgr)
-        return _resize_mask(_segment(bgr, near, core, core, free, unknown, _BAND * size), photo.camera)
+        return _resize_mask(_segment(bgr, near, core, core, free, unknown, band), photo.camera)
 
     return make
 

@@ -33,9 +33,7 @@ MIN_REGISTERED = 0.75
 """Minimum fraction of photos with a camera for a successful capture."""
 
 _MAX_COORDINATE = 1e9
-"""Largest accepted coordinate of a camera or a point, in units of the model; geocentric coordinates in metres reach
-6e6.
-"""
+"""Largest accepted coordinate of cameras and points [units of the model]; geocentric ones in metres reach 6e6."""
 _MAX_OBLONG = 1.2
 """Ratio of the focal lengths along x and y above which they are named."""
 _MAX_OFFSET = 0.2
@@ -103,8 +101,8 @@ def _read_model(
     """Return the model of a file, its photos by the names in the file, and the names whose image size is stated."""
     by_name = {photo.name: photo for photo in photos}
     everything = [*by_name, *unusable]
+    refuse_calibration(source, POSES_RULE)
     if source.is_dir():
-        refuse_calibration(source, POSES_RULE)
         model = read_colmap_model(source, folder / "given")
         paths = {name: PurePosixPath(name.replace("\\", "/")) for name in model.cameras}
         names = match_names(source, paths, base, everything)
@@ -119,7 +117,6 @@ def _read_model(
         sizes = {name: photo.full_size or photo.size for name, photo in own.items()}
         model, sized = read_transforms(source, content, sizes)
     else:
-        refuse_calibration(source, POSES_RULE)
         raise InputError(f"{source}: {POSES_RULE}")
     matched = {name: by_name[photo] for name, photo in names.items() if photo in by_name and name in model.cameras}
     if len(matched) < 2:

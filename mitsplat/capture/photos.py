@@ -107,7 +107,7 @@ def find_photos(folder: Path, *, masks: Path | None = None) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: must be an existing folder of photographs, or a video")
-    found, copies = list[Path](), dict[str, Path]()
+    copies: dict[str, Path] = {}
     for path in files_below(folder, skip=masks):
         name = path.relative_to(folder).as_posix()
         if path.suffix.lower() not in SUFFIXES + _UNSUPPORTED or not path.is_file() or "/." in f"/{name}":
@@ -117,8 +117,7 @@ def find_photos(folder: Path, *, masks: Path | None = None) -> list[Path]:
             other = copies.setdefault(stored_name(name, suffix), path)
             if other != path:
                 raise InputError(f"{path}: its copy would have the same name as that of {other}: rename one of them")
-        found.append(path)
-    return found
+    return list(dict.fromkeys(copies.values()))
 
 
 def prepare_photos(

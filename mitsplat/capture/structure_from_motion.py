@@ -15,7 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +38,7 @@ With fewer points, camera errors of 20 % were measured at reprojection errors of
 """
 
 MIN_AGREEMENT = 0.5
-"""Minimum fraction of a photo's matches that must agree with its camera; in photos of a statue, all had 98 % or more.
-"""
+"""Minimum fraction of a photo's matches that agree with its camera; in photos of a statue, all had 98 % or more."""
 
 SURE_AGREEMENT = 0.65
 """Fraction of agreeing matches below which a camera is doubtful, unless a board confirms it."""
@@ -109,14 +108,12 @@ class SparseModel:
         kept = [name for name in self.cameras if name not in names]
         stays = count_observers([self.seen[name] for name in kept], len(self.points)) >= 2
         place = np.cumsum(stays) - 1
-        return SparseModel(
-            {name: self.cameras[name] for name in kept},
-            self.points[stays],
-            self.colours[stays],
-            {name: place[self.seen[name][stays[self.seen[name]]]].astype(np.int32) for name in kept},
-            self.elsewhere,
-            self.reprojection_error,
-            self.agreement,
+        return replace(
+            self,
+            cameras={name: self.cameras[name] for name in kept},
+            points=self.points[stays],
+            colours=self.colours[stays],
+            seen={name: place[self.seen[name][stays[self.seen[name]]]].astype(np.int32) for name in kept},
         )
 
 

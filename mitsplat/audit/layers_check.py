@@ -41,6 +41,8 @@ class LayersCheck(DatasetCheck):
 
     def __init__(self, content: JsonObject) -> None:
         self._belt = BeltMotion(content)
+        # Depth and flow are those of the splats. Masks of proxies also have pixels that show what is behind the splats.
+        self._has_exact_masks = content["scene"]["labels"]["source"] == "splats"
         self._last: tuple[DecodedFrame, Float64Array, float] | None = None
 
     def check(self, frame: DecodedFrame) -> Violations:
@@ -87,13 +89,15 @@ class LayersCheck(DatasetCheck):
         wrong, rest = np.zeros(depth.size, dtype=bool), check.known.copy()
         for seen, motion in motions:
             chosen = check.known & seen.ravel()
-            rest &= ~chosen
-            if motion is not None and chosen.any():
-                wrong[chosen] = check.contradicts(motion, chosen)
-        # Pixels without a labelled instance may show static parts, a belt, or fragments of instances that move.
+            if motion is None or self._has_exact_masks:
+                rest &= ~chosen
+                if motion is not None and chosen.any():
+                    wrong[chosen] = check.contradicts(motion, chosen)
+        # The other pixels may show static parts, a belt, or instances that move.
         run = np.eye(4)
         run[:3, 3] = self._belt.between(before, frame)
-        wrong[rest] = not _has_unlabelled_motion(before)
+        is_removed = not self._has_exact_masks and any(motion is None for _, motion in motions)
+        wrong[rest] = not (is_removed or _has_unlabelled_motion(before))
         for motion in (np.eye(4), run, *(motion for _, motion in motions if motion is not None)):
             left = wrong & rest
             if left.any():

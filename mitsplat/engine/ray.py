@@ -247,7 +247,7 @@ class _Actors(Generic[Result]):
         for reference in ready:
             worker, frame, layout = self._answers.pop(reference)
             try:
-                yield worker, self._ray.get(reference)
+                answer = self._ray.get(reference)
             except self._ray.exceptions.RayError as error:
                 _, settler = self._layouts.pop(layout, (None, None))
                 if settler not in (None, worker):
@@ -255,6 +255,10 @@ class _Actors(Generic[Result]):
                     continue
                 self.stop(worker)
                 yield worker, Lost(f"was lost ({str(error).strip().splitlines()[0]})")
+            else:
+                if isinstance(answer, Failure):  # the settling may have failed, which is then repeated with the frame
+                    self._layouts.pop(layout, None)
+                yield worker, answer
 
     def close(self) -> None:
         for worker in list(self._actors):

@@ -28,6 +28,7 @@ from mitsplat.engine.ray import Cluster
 from mitsplat.errors import InputError, MissingResourceError
 from mitsplat.formats.registry import Catalogue
 from mitsplat.frames.frame import Renderer
+from mitsplat.progress import discard_note
 from mitsplat.scene.loading.scene_loading import load_scene
 from mitsplat.scene.planning.frame_plan import plan_frame
 from mitsplat.scene.spec.scene_spec import FORMATS
@@ -362,6 +363,70 @@ def test_a_ray_worker_has_a_thread_for_each_reserved_cpu(monkeypatch, resources,
     monkeypatch.setattr(ray, "get", lambda job: SimpleNamespace(make=lambda frame, layout: frame), raising=False)
     assert cluster._Actor(["job"], "cpu", threads).make(3, "layout").result == 3
     assert used == [("cpu", threads)]
+
+
+class DirectRay(FakeRay):
+    """Mock of Ray whose actors answer at once in this process."""
+
+    exceptions = SimpleNamespace(RayError=ConnectionError)
+
+    def put(self, value):
+        return SharedValue(value)
+
+    def get(self, reference):
+        return reference.value
+
+    def kill(self, actor):
+        pass
+
+    def wait(self, references, **_):
+        return references[:1], references[1:]
+
+    def remote(self, kind):
+        def method(function):
+            return SimpleNamespace(
+                remote=lambda *arguments: SharedValue(
+                    function(*(one.value if isinstance(one, SharedValue) else one for one in arguments))
+                )
+            )
+
+        def start(*arguments):
+            actor = kind(*arguments)
+            return SimpleNamespace(settle=method(actor.settle), make=method(actor.make))
+
+        return SimpleNamespace(options=lambda **options: SimpleNamespace(remote=start))
+
+
+@dataclass(frozen=True, eq=False)
+class SharedValue:
+    """Reference to a value in Ray's object store."""
+
+    value: object
+
+
+class FailingOnce:
+    """Job whose layout can be settled at the second try."""
+
+    settled = 0
+
+    def cached_layout(self, layout):
+        return None
+
+    def settle(self, layout):
+        self.settled += 1
+        if self.settled == 1:
+            raise MemoryError("no memory")
+        return "layout"
+
+    def make(self, index, layout):
+        return index, layout
+
+
+def test_a_layout_that_failed_on_ray_is_settled_again(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", DirectRay(head=4.0))
+    monkeypatch.setattr(cluster, "use_shared_device", lambda *device: None)
+    found = cluster.run_on_ray(FailingOnce(), {0: [0, 1]}, Cluster(resources={"CPU": 2.0}), note=discard_note)
+    assert sorted(found) == [(0, "layout"), (1, "layout")]
 
 
 def test_machines_that_join_are_reported_once(monkeypatch):

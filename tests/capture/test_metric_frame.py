@@ -222,6 +222,20 @@ def test_tags_determine_scale_and_vertical(tmp_path: Path) -> None:
     assert find_metric_frame(model, images).units == "unknown"
 
 
+@pytest.mark.parametrize("turn", [0.0, 7.0, 40.0])
+def test_corners_of_tags_are_found_within_a_fifth_of_a_pixel(turn: float) -> None:
+    """A tag is drawn with an edge of 60 px around the middle of a picture, with 64 samples per pixel."""
+    family, fine, width = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), 8, 160
+    printed = np.pad(cv2.aruco.generateImageMarker(family, 5, 600), 400, constant_values=255)
+    rotation = Rotation.from_euler("z", turn, degrees=True).as_matrix()[:2, :2]
+    y, x = (np.mgrid[: fine * width, : fine * width] + 0.5) / fine - width / 2
+    column, row = (np.stack([x, y], axis=-1) @ rotation * 10 + 700).astype(int).clip(0, 1399).transpose(2, 0, 1)
+    picture = printed[row, column].reshape(width, fine, width, fine).mean(axis=(1, 3))
+    expected = np.array([(-30, -30), (30, -30), (30, 30), (-30, 30)]) @ rotation.T + width / 2
+    found = find_tags(np.rint(picture).astype(np.uint8))[5]
+    np.testing.assert_allclose(found, expected, atol=0.2)
+
+
 @pytest.fixture
 def blank(tmp_path: Path) -> dict[str, Path]:
     Image.new("L", (640, 480), 90).save(tmp_path / "blank.png")

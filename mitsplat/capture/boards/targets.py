@@ -156,5 +156,6 @@ def find_tags(grey: npt.NDArray[np.uint8]) -> dict[int, Float64Array]:
     if ids is None:
         return {}
     numbers = [int(number) for number in np.ravel(ids)]
-    corners = (np.asarray(quad, dtype=np.float64).reshape(4, 2) + 0.5 for quad in quads)
+    # This refinement has pixel centres at +0.5, unlike the rest of OpenCV.
+    corners = (np.asarray(quad, dtype=np.float64).reshape(4, 2) for quad in quads)
     return {number: quad for number, quad in zip(numbers, corners, strict=True) if numbers.count(number) == 1}

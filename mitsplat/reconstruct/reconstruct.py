@@ -62,7 +62,7 @@ class ImportedMesh:
 
     Attributes:
         mesh: Mesh in its own frame.
-        capture_from_mesh: Transform to the capture's frame, shape (4, 4); None to register the mesh to the splats.
+        capture_from_mesh: Similarity to the capture's frame, shape (4, 4); None to register the mesh to the splats.
         metres_per_unit: Scale of the mesh [m]; the registration to a capture in metres keeps it, and it gives the scale
             of a capture of unknown units.
     """

@@ -64,20 +64,39 @@ def seed_points(
 
 
 def _random_points(cameras: Sequence[Camera], masks: Sequence[Mask] | None, rng: np.random.Generator) -> Float64Array:
-    """Return random points in a ball around the common focus of the cameras, or in its part inside the visual hull.
-
-    A point belongs to the hull if it is inside at least 90 % of the largest number of masks that share a point.
-    """
+    """Return random points in a ball around the common focus of the cameras, or in the visual hull of masks."""
     centres, axes = optical_axes(cameras)
     focus = nearest_point_to_lines(centres, axes, pull=1e-3 * len(centres))
     reach = float(np.median(np.linalg.norm(centres - focus, axis=1))) or 1.0
-    ball = rng.normal(size=(_RANDOM_POINTS if masks is None else _HULL_CANDIDATES, 3))
+    if masks is not None:
+        return _hull_points(cameras, masks, reach, rng)
+    ball = rng.normal(size=(_RANDOM_POINTS, 3))
     ball *= rng.random((len(ball), 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
-    ball = focus + 0.9 * reach * ball
-    if masks is None:
-        return ball
-    inside = np.zeros(len(ball))
+    return np.asarray(focus + 0.9 * reach * ball)
+
+
+def _hull_points(
+    cameras: Sequence[Camera], masks: Sequence[Mask], reach: float, rng: np.random.Generator
+) -> Float64Array:
+    """Return random points in the visual hull, at random depths behind pixels of the masks.
+
+    A point belongs to the hull if it is inside at least 90 % of the largest number of masks that share a point.
+
+    Args:
+        cameras: Cameras of the masks.
+        masks: Share of each pixel that the object covers, one image per camera.
+        reach: Distance of the cameras from their common focus.
+        rng: Random number generator.
+    """
+    candidates = [np.zeros((0, 3))]
     for camera, mask in zip(cameras, masks, strict=True):
-        inside += camera.sample(mask, ball, missing=-1.0) > 0.5
-    hull: Float64Array = ball[inside >= max(1.0, 0.9 * inside.max())]
+        rows = np.argwhere(mask > 0.5)
+        chosen = rows[rng.integers(len(rows), size=_HULL_CANDIDATES // len(cameras))] if len(rows) else rows
+        depths = reach * rng.uniform(0.1, 1.9, len(chosen))
+        candidates.append(camera.unproject(chosen[:, ::-1] + rng.random(chosen.shape), depths))
+    points = rng.permutation(np.concatenate(candidates))
+    inside = np.zeros(len(points))
+    for camera, mask in zip(cameras, masks, strict=True):
+        inside += camera.sample(mask, points, missing=-1.0) > 0.5
+    hull: Float64Array = points[inside >= max(1.0, 0.9 * inside.max(initial=0))]
     return hull[:_RANDOM_POINTS]

@@ -31,6 +31,7 @@ from mitsplat.fit.training_view import TrainingView
 from mitsplat.gaussians.spherical_harmonics import SH_C0
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import spiral
 from mitsplat.images.colour import encode_srgb
 from mitsplat.renderer.layers import render_splats
 from mitsplat.runtime.variant import ensure_variant
@@ -449,3 +450,20 @@ def test_without_points_the_visual_hull_is_filled(capture: Capture) -> None:
     assert len(radius) > 1000 and np.percentile(radius, 95) < 0.6
     free = seeds(capture, np.zeros((0, 3)), masked=False)
     assert len(free) == 3000 and np.linalg.norm(free, axis=1).max() > 1
+
+
+def test_the_visual_hull_of_a_small_part_is_filled() -> None:
+    """The part has a hundredth of the cameras' distance, and is not where they are directed."""
+    middle, radius = np.array([0.02, 0.01, 0.0]), 0.005
+    cameras = [
+        Camera.look_at(eye, (0, 0, 0), width=400, height=300, fov_x=40)
+        for eye in 0.4 * spiral(np.linspace(0.2, 0.9, 12))
+    ]
+    masks = []
+    for camera in cameras:
+        (pixel,), (depth,) = camera.project([middle])
+        y, x = np.mgrid[:300, :400] + 0.5
+        masks.append((np.hypot(x - pixel[0], y - pixel[1]) < radius * camera.fx / depth).astype(np.float32))
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), cameras, [np.zeros(0, np.int32)] * 12, masks
+    points, _ = seed_points(*nothing, np.random.default_rng(0), 10_000)
+    assert len(points) > 500 and np.linalg.norm(points - middle, axis=1).max() < 1.5 * radius

@@ -27,6 +27,7 @@ from mitsplat.arrays import BoolArray, Float32Array, Float64Array
 from mitsplat.errors import InputError
 from mitsplat.gaussians.splat_cloud import Splats
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.lens import largest_slope
 from mitsplat.progress import Progress
 from mitsplat.reconstruct.simplification import large_shells, separate_vertices, simplify_surface
 from mitsplat.renderer.layers import make_sensor, render_splats
@@ -248,6 +249,9 @@ class _Grid:
         ahead = z > view.near_plane
         u, v = x / z, y / z
         if camera.distortion:
+            # Beyond this slope, the distortion would fold cells into the picture.
+            steepest = dr.opaque(mi.Float, largest_slope(camera.distortion, camera.lens))
+            ahead &= dr.hypot(u, v) < steepest
             u, v, _ = view.distort(u, v)
         own = view._opaque
         pixel = mi.Point2f(u * own["fx"] + own["cx"], v * own["fy"] + own["cy"])

@@ -15,12 +15,14 @@ from skimage.measure import marching_cubes
 from benchmarks.assets.known import chamfer
 from mitsplat.errors import InputError
 from mitsplat.geometry.camera import Camera
+from mitsplat.geometry.camera_poses import look_at_pose
 from mitsplat.geometry.mesh import prepare_mesh
 from mitsplat.geometry.mesh_distance import DistanceSurface
 from mitsplat.mesh_files.mesh_reading import read_mesh
 from mitsplat.reconstruct.registration import invert_transform, measure_offset, register_mesh, surface_points
 from mitsplat.reconstruct.simplification import simplify_surface
-from mitsplat.reconstruct.surface import SurfaceSettings, _close_voids, reconstruct_surface
+from mitsplat.reconstruct.surface import SurfaceSettings, _close_voids, _Grid, reconstruct_surface
+from mitsplat.runtime.variant import ensure_variant
 from tests.conftest import KnownObject
 
 
@@ -32,6 +34,21 @@ def views_of(known: KnownObject) -> tuple[list[Camera], list[np.ndarray]]:
 @pytest.fixture(scope="module")
 def surface(known_object: KnownObject) -> trimesh.Trimesh:
     return reconstruct_surface(known_object.splats, *views_of(known_object), SurfaceSettings(voxels=96, faces=6000))
+
+
+@pytest.mark.parametrize(
+    ("lens", "distortion"),
+    [("opencv", ()), ("opencv", (-0.1, 0, 0, 0)), ("opencv", (-0.3, 0.05, 1e-3, 0)), ("fisheye", (-0.05, -0.01, 0, 0))],
+)
+def test_cells_in_a_picture_are_those_that_its_camera_projects(lens: Any, distortion: tuple[float, ...]) -> None:
+    """The polynomial of a barrel distortion also folds cells beside the view into the picture."""
+    ensure_variant()
+    pose = look_at_pose((0, 0, 0), (1, 0, 0))
+    camera = Camera(320, 240, 240.0, 250.0, 165.0, 118.0, pose, distortion=distortion, lens=lens)
+    grid = _Grid(np.array([0.0513, -2.017, -1.983]), 0.1, (20, 40, 40), 0.3)
+    cells = grid.low + (np.stack(np.unravel_index(np.arange(grid.count), grid.shape), axis=1) + 0.5) * grid.cell
+    shown = np.flatnonzero(np.array(grid._seen_from(camera)[2]))
+    np.testing.assert_array_equal(shown, camera.visible_pixels(cells)[0])
 
 
 def test_the_surface_agrees_with_the_solid(known_object: KnownObject, surface: trimesh.Trimesh) -> None:

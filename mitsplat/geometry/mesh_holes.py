@@ -46,8 +46,11 @@ def close_holes(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         if len(rim) > _MAX_EDGES:
             continue
         hole = ends[rim]
+        largest = (_MAX_SHARE if len(hole) > 3 else _FLAT) * float(sizes[rim].max())
+        if _smallest_area(vertices[hole]) > largest:
+            continue
         triangles, area = _smallest_patch(hole, vertices[hole], edges)
-        if area <= (_MAX_SHARE if len(hole) > 3 else _FLAT) * sizes[rim].max():
+        if area <= largest:
             found.append(triangles)
     if not found:
         return mesh
@@ -102,6 +105,12 @@ def _angles(spokes: Float64Array, normal: Float64Array) -> Float64Array:
     one, others = spokes[0], spokes[1:]
     angles = np.arctan2(np.cross(others, one) @ normal, others @ one - (others @ normal) * (one @ normal))
     return np.asarray(angles % (2 * np.pi))
+
+
+def _smallest_area(points: Float64Array) -> float:
+    """Return a lower bound of the area of any patch of a loop (N, 3): the length of its vector area."""
+    spokes = points - points[0]
+    return 0.5 * float(np.linalg.norm(np.cross(spokes[:-1], spokes[1:]).sum(axis=0)))
 
 
 def _smallest_patch(loop: Int64Array, points: Float64Array, edges: set[tuple[int, int]]) -> tuple[Int64Array, float]:

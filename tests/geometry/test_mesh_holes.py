@@ -139,6 +139,14 @@ def test_many_small_sheets_are_no_fragments() -> None:
     assert close_holes(plant) is plant
 
 
+def test_large_openings_are_not_triangulated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each triangulation of the ends of the tube, 400 edges, takes 2 s."""
+    monkeypatch.delattr("mitsplat.geometry.mesh_holes._smallest_patch")
+    cylinder = trimesh.creation.cylinder(0.005, 0.05, sections=400)
+    tube = without(cylinder, np.abs(cylinder.face_normals[:, 2]) > 0.5)
+    assert close_holes(tube) is tube
+
+
 def test_a_closed_mesh_is_returned_unchanged() -> None:
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     assert close_holes(box) is box

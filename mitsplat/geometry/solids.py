@@ -23,7 +23,7 @@ _MIN_SHARE = 1e-6
 _CLOSE = 1e-6
 """Distance relative to the size below which surfaces touch."""
 _POINTS = 16
-"""Maximum number of vertices of a cavity that are tested for being inside of a body."""
+"""Maximum number of faces of a cavity that are tested for being inside of a body."""
 _SAME_ANGLE = 1e-4
 """Angle about a common edge below which faces of two solids coincide [rad]."""
 
@@ -170,19 +170,25 @@ def unite_bodies(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     cavities, debris, outlines = surfaces[:first], surfaces[first:last], surfaces[last:]
     if len(outlines) < 2:
         return mesh
-    low, high = np.moveaxis(np.array([outline.bounds for outline in outlines]), 1, 0)
-    close = _CLOSE * mesh.scale
-    meets = ((low[:, None] < high + close) & (low < high[:, None] + close)).all(axis=2).sum(axis=1) > 1
+    meets = _meeting(np.array([outline.bounds for outline in outlines]), _CLOSE * mesh.scale)
     if not meets.any():
         return mesh
     bodies = [[outline] for outline in outlines]
     for cavity in cavities:  # belongs to the smallest body around it
-        points = cavity.vertices[:: len(cavity.vertices) // _POINTS + 1]
+        points = cavity.triangles_center[:: len(cavity.faces) // _POINTS + 1]  # its vertices may touch the body
         around = (body for body in bodies if points_inside(body[0], points).all())
         next(around, []).append(cavity)
-    solids = [join_meshes(body) for body in bodies]
-    union = trimesh.boolean.union([solids[number] for number in np.flatnonzero(meets)], engine="manifold")
-    return join_meshes([*debris, *(solids[number] for number in np.flatnonzero(~meets)), union])
+    united = [_body(*bodies[number]) for number in np.flatnonzero(meets)]
+    union = manifold3d.Manifold.batch_boolean(united, manifold3d.OpType.Add)
+    apart = [surface for number in np.flatnonzero(~meets) for surface in bodies[number]]
+    return join_meshes([*debris, *apart, _mesh_of(union)])
+
+
+def _body(outline: trimesh.Trimesh, *cavities: trimesh.Trimesh) -> manifold3d.Manifold:
+    """Return a body without its cavities, which may overlap, as a solid of Manifold."""
+    voids = [trimesh.Trimesh(cavity.vertices, cavity.faces[:, ::-1], process=False) for cavity in cavities]
+    solids = [solid_manifold(solid) for solid in (outline, *voids)]
+    return manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Subtract)
 
 
 def signed_volume(surface: trimesh.Trimesh) -> float:
@@ -202,6 +208,18 @@ def _around(bounds: Float64Array, inner: Float64Array) -> BoolArray:
     return np.asarray(((bounds[:, 0] <= inner[0]) & (inner[1] <= bounds[:, 1])).all(axis=1))
 
 
+def _meeting(bounds: Float64Array, distance: float) -> BoolArray:
+    """Return a mask of the bounds (N, 2, 3) within a distance of others, along each axis."""
+    low, high = np.moveaxis(bounds[np.argsort(bounds[:, 0, 0])], 1, 0)
+    meets = np.zeros(len(bounds), dtype=bool)
+    for first, end in enumerate(np.searchsorted(low[:, 0], high[:, 0] + distance)):
+        later = slice(first + 1, end)
+        near = ((low[later] < high[first] + distance) & (low[first] < high[later] + distance)).all(axis=1)
+        meets[later] |= near
+        meets[first] |= near.any()
+    return meets[np.argsort(np.argsort(bounds[:, 0, 0]))]
+
+
 def join_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Return all triangles as one mesh."""
     return cast(trimesh.Trimesh, trimesh.util.concatenate(list(meshes)))
@@ -213,6 +231,12 @@ def solid_manifold(solid: trimesh.Trimesh) -> manifold3d.Manifold:
     # Manifold refuses subclasses of NumPy arrays whose rows are not contiguous. Reordered faces are such arrays.
     vertices = np.ascontiguousarray(solid.vertices, np.float32)
     return manifold3d.Manifold(manifold3d.Mesh(vertices, np.ascontiguousarray(solid.faces, np.uint32)))
+
+
+def _mesh_of(manifold: manifold3d.Manifold) -> trimesh.Trimesh:
+    """Return the surface of a solid of Manifold."""
+    mesh = manifold.to_mesh()
+    return trimesh.Trimesh(mesh.vert_properties[:, :3].astype(np.float64), mesh.tri_verts, process=False)
 
 
 def simplify_solid(solid: trimesh.Trimesh, *tolerances: float, most: int = 0) -> trimesh.Trimesh:
@@ -227,8 +251,7 @@ def simplify_solid(solid: trimesh.Trimesh, *tolerances: float, most: int = 0) ->
     for tolerance in tolerances:
         simple = manifold.simplify(tolerance)
         if simple.num_tri() < len(fewest.faces):
-            mesh = simple.to_mesh()
-            found = trimesh.Trimesh(mesh.vert_properties[:, :3].astype(np.float64), mesh.tri_verts, process=False)
+            found = _mesh_of(simple)
             fewest = found if found.is_volume else fewest
         if len(fewest.faces) <= most:
             break

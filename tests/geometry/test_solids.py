@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import shapely
@@ -223,3 +225,34 @@ def test_winding_numbers_count_the_bodies_around_a_point() -> None:
     mesh = trimesh.util.concatenate([ball(0.05), ball(0.04), inside_out(ball(0.01, x=0.1))])
     points = np.array([[0, 0, 0], [0.045, 0, 0], [0.1, 0, 0], [0, 0.2, 0]])
     np.testing.assert_allclose(winding_numbers(mesh, points), [2, 1, -1, 0], atol=1e-9)
+
+
+def test_a_cavity_that_touches_the_surface_of_its_body_stays() -> None:
+    """A tetrahedron with a corner on the top of a box, which touches another box."""
+    corners = [(0, 0, 0.015), (0.005, 0, 0), (-0.005, 0.005, 0), (-0.005, -0.005, 0)]
+    cavity = inside_out(trimesh.convex.convex_hull(np.array(corners)))
+    mesh = trimesh.util.concatenate([box(BLOCK), cavity, box(BLOCK, (0.05, 0, 0))])
+    assert unite_bodies(mesh).volume == pytest.approx(12e-5 + cavity.volume)
+
+
+def test_cavities_that_overlap_are_united() -> None:
+    """Their volume is larger than that of their body, which touches another one."""
+    cavities = [inside_out(box((0.03, 0.03, 0.02), (x, 0, 0))) for x in (-0.005, 0, 0.005)]
+    mesh = trimesh.util.concatenate([box(BLOCK), *cavities, box(BLOCK, (0.05, 0, 0))])
+    assert unite_bodies(mesh).volume == pytest.approx(12e-5 - 0.04 * 0.03 * 0.02, rel=1e-6)
+
+
+def test_uniting_many_bodies_needs_little_memory() -> None:
+    """Arrays of all pairs of bodies would need 50 MB."""
+    count = 2500
+    places = np.stack(np.meshgrid(*[np.arange(14)] * 3), axis=-1).reshape(-1, 3)[:count]
+    one = box((0.4, 0.4, 0.4))
+    vertices = (one.vertices + places[:, None]).reshape(-1, 3)
+    faces = (one.faces + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    tracemalloc.start()
+    try:
+        assert unite_bodies(mesh) is mesh
+        assert tracemalloc.get_traced_memory()[1] < 25e6
+    finally:
+        tracemalloc.stop()

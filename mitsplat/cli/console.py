@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from mitsplat.findings import Finding
     from mitsplat.runtime.device import Device
 
-_INTERRUPTED = "interrupted: run the command again, without --overwrite, to continue"
+_CONTINUED = ("render", "merge", "train")
+"""Commands that continue what an interrupted call has begun."""
 
 
 def select_device(name: str) -> None:
@@ -52,12 +53,15 @@ def command_log(
     Yields:
         Function that returns a context manager for one progress callback.
     """
+    interrupted = "interrupted"
+    if command in _CONTINUED:
+        interrupted += ": run the command again, without --overwrite, to continue"
     if not json_log:
         try:
             yield lambda: progress_bar(unit)
         except BaseException as error:
             if exit_status(error) == INTERRUPTED:
-                typer.echo(f"mitsplat: {_INTERRUPTED}", err=True)
+                typer.echo(f"mitsplat: {interrupted}", err=True)
             raise
         return
 
@@ -76,7 +80,7 @@ def command_log(
             raise
         status, sentence = fault.outcome_of(error)
         if status == INTERRUPTED:
-            sentence = _INTERRUPTED
+            sentence = interrupted
         emit("failed", status=status, error=type(error).__name__, message=sentence)
         if status == INTERRUPTED:
             raise

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from mitsplat.cli.console import command_log
 from mitsplat.errors import InputError, MissingResourceError, PartialResultError
 from tests.cli.typed import Calls, run
 from tests.conftest import box_asset
@@ -135,3 +136,12 @@ def test_an_interrupt_ends_with_status_130_and_the_way_to_continue(
     assert capsys.readouterr().err == f"mitsplat: {sentence}\n"
     assert run("render", scene_path, "--json") == 130
     assert json.loads(capsys.readouterr().err.splitlines()[-1])["message"] == sentence
+
+
+@pytest.mark.parametrize("command", ["evaluate", "compare"])
+def test_an_interrupted_command_that_starts_anew_names_no_way_to_continue(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(KeyboardInterrupt), command_log(False, command):
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err == "mitsplat: interrupted\n"

@@ -101,7 +101,7 @@ class Scene:
         It is inside the convex hull of the object, unlike its origin, which may be anywhere.
         """
         found = (np.zeros(3) if asset.mesh is None else asset.mesh.centroid for asset in self.assets)
-        return tuple((x, y, z) for x, y, z in (centroid.round(6).tolist() for centroid in found))
+        return tuple((x, y, z) for x, y, z in ((centroid.round(6) + 0.0).tolist() for centroid in found))
 
     def entry_of(self, asset: int) -> ObjectSpec:
         """Return the entry of ``spec.objects`` to which an asset belongs."""

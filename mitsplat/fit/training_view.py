@@ -12,7 +12,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from mitsplat.arrays import Float32Array, Float64Array
-from mitsplat.capture.capture import Photo, Window
+from mitsplat.capture.capture import Photo, Window, stored_name
 from mitsplat.fit.depth_priors import DepthMap, resize_map
 from mitsplat.fit.image_metrics import psnr, ssim
 from mitsplat.fit.optimizer import GaussianModel
@@ -176,8 +176,8 @@ class TrainingView:
         if folder is not None:
             difference = np.clip(_DIFFERENCE_GAIN * np.abs(seen - truth), 0, 1)
             sheet = np.rint(np.concatenate([truth, seen, difference], axis=1) * 255).astype(np.uint8)
-            stem = Path(self._photo.name).with_suffix("").as_posix().replace("/", "_")
-            write_file(folder / f"{stem}.png", lambda path: Image.fromarray(sheet).save(path, format="PNG"))
+            file = folder / stored_name(self._photo.name, ".png")
+            write_file(file, lambda path: Image.fromarray(sheet).save(path, format="PNG"))
         return HeldOut(
             name=self._photo.name,
             psnr=psnr(seen, truth),

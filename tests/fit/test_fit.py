@@ -430,6 +430,15 @@ def test_settings_out_of_range_are_refused(change: dict[str, float], text: str) 
         FitSettings(**change)  # type: ignore[arg-type]
 
 
+def test_photos_that_differ_in_their_suffix_have_comparisons_of_their_own(tmp_path: Path) -> None:
+    camera = Camera.look_at((0, 0, 1), (0, 0, 0), up=(0, 1, 0), width=40, height=30, fov_x=40)
+    for name in ("a.png", "a.jpg"):
+        Image.new("RGB", (40, 30)).save(tmp_path / name)
+        view = TrainingView(Photo(name, tmp_path / name, camera), 1.0, masked=False)
+        view.compare(np.zeros((30, 40, 3), np.float32), tmp_path / "held_out")
+    assert sorted(path.name for path in (tmp_path / "held_out").iterdir()) == ["a.jpg.png", "a.png"]
+
+
 def seeds(capture: Capture, points: np.ndarray, *, masked: bool = True) -> np.ndarray:
     cameras = [photo.camera for photo in capture.training]
     masks = [photo.read().mask for photo in capture.training] if masked else None

@@ -36,7 +36,8 @@ scene = load_scene(sys.argv[1])
 poses = [np.eye(4) for _ in range(6)]
 for i, pose in enumerate(poses):
     pose[:2, 3] = 0.05 * i - 0.12, 0.02 * i
-layout = Layout(0, tuple(Instance(i + 1, i % 2, i % 2, pose) for i, pose in enumerate(poses)), NO_PHYSICS)
+objects = (Instance(i + 1, i % 2, scene.class_index(i % 2), pose) for i, pose in enumerate(poses))
+layout = Layout(0, tuple(objects), NO_PHYSICS)
 for index in range(2):
     render_frame(scene, index, layout=layout)
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))

@@ -352,12 +352,12 @@ class Renderer:
     def _label(
         self, layers: Layers, silhouettes: Mapping[int, Silhouette], layout: Layout, camera: Camera, shown: mi.Scene
     ) -> Labels:
-        """Label the instances by the ids of splats or proxies. The depth that is not used stays on the device."""
+        """Label the instances by the ids of splats or proxies; the depth is that of the picture for both."""
         scene, rules, hits = self.scene, self.scene.spec.labels, partial(find_hits, self.integrator, shown)
-        if rules.source == "splats":
-            truth = Truth(layers.instance, layers.proxy_instance, silhouettes, layers.depth)
-        else:
-            truth = Truth(layers.proxy_instance, layers.instance, silhouettes, layers.proxy_depth)
+        ids, other_ids = layers.instance, layers.proxy_instance
+        if rules.source == "proxies":
+            ids, other_ids = other_ids, ids
+        truth = Truth(ids, other_ids, silhouettes, layers.depth)
         keypoints = {number: asset.keypoint_array for number, asset in enumerate(scene.assets) if asset.keypoints}
         blocked = find_blocked_keypoints(scene.assets, layout.instances, camera, hits)
         return label_instances(

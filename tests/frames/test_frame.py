@@ -238,23 +238,34 @@ def test_a_frame_has_its_plan_and_layers(scene: ms.Scene, settled: dict[str, Any
     np.testing.assert_array_equal(again.layers.highlight, frame.layers.highlight)
 
 
-@pytest.mark.parametrize(("source", "depth"), [("splats", "depth"), ("proxies", "proxy_depth")])
+@pytest.mark.parametrize("source", ["splats", "proxies"])
 def test_labels_transfer_only_ids_and_one_depth_to_the_host(
     scene_data: dict[str, Any],
     write_scene: WriteScene,
     scene: ms.Scene,
     settled: dict[str, Any],
     source: str,
-    depth: str,
 ) -> None:
     chosen = ms.load_scene(write_scene(scene_data | {"labels": {"source": source}}, f"{source}.yaml"))
     frame = ms.render_frame(chosen, 1, layout=layout_of_small_scene(scene, settled))
     names = {field.name for field in fields(frame.layers)}
-    assert names & vars(frame.layers).keys() == {"instance", "proxy_instance", depth}
+    assert names & vars(frame.layers).keys() == {"instance", "proxy_instance", "depth"}
     assert "rgb" not in vars(frame)
     np.testing.assert_array_equal(frame.rgb, lit_picture(frame.layers, chosen.spec.composite))
     again = develop(frame.rgb, frame.plan.draws, chosen.spec.composite, seed=frame.plan.seed)
     np.testing.assert_array_equal(again, frame.image)
+
+
+def test_the_depth_area_of_a_proxy_is_that_of_the_picture(scene_data: dict[str, Any], write_scene: WriteScene) -> None:
+    """The depth files are those of the splats, which leave the corners of the box empty."""
+    scene_data["shapes"][0]["visible"] = False
+    scene_data |= {"objects": [{"asset": "assets/nut", "scale": 4}], "labels": {"source": "proxies"}}
+    scene = ms.load_scene(write_scene(scene_data))
+    frame = ms.render_frame(scene, 0, layout=ms.Layout.from_poses(scene, {"nut": [np.eye(4)]}))
+    (label,) = frame.labels.instances
+    silhouette = label.amodal.image_mask(64, 48)
+    assert 0 < label.depth_area < label.amodal.area
+    assert label.depth_area == np.count_nonzero(silhouette & (frame.depth > 0))
 
 
 def test_a_closed_renderer_is_refused(

@@ -12,8 +12,10 @@ from mitsplat.geometry.rigid import transform_points
 from mitsplat.scene.layout import Layout
 from mitsplat.scene.planning.conveyor import Belt
 
-UNKNOWN_FLOW = 1e10
-"""Value of both components where no flow exists, as in Middlebury's files (values above 1e9 mean unknown)."""
+UNKNOWN_FLOW, MAX_FLOW = 1e10, 1e9
+"""Value of both components where no flow exists, and limit of flow [px]; values above it mean unknown in Middlebury's
+files.
+"""
 
 
 def optical_flow(
@@ -26,8 +28,9 @@ def optical_flow(
 ) -> Float32Array:
     """Compute the motion of every pixel to the next image [px], (H, W, 2).
 
-    The flow is :data:`UNKNOWN_FLOW` where the pixel shows nothing, or where its point lies behind the next camera or
-    belongs to an object that is removed. Points that become occluded in the next image have ordinary flow.
+    The flow is :data:`UNKNOWN_FLOW` where the pixel shows nothing, or where its point lies behind the next camera, at
+    more than :data:`MAX_FLOW` from the pixel, or belongs to an object that is removed. Points that become occluded in
+    the next image have ordinary flow.
 
     Args:
         depth: Depth along the optical axis [m], 0 for no surface, (H, W).
@@ -52,8 +55,10 @@ def optical_flow(
     if belt is not None:
         points[np.ravel(ids == 0) & belt.on_surface(points)] += belt.interval * belt.velocity
     next_pixels, next_depth = next_camera.project(points)
-    known &= (next_depth > next_camera.near) & np.isfinite(next_pixels).all(axis=1)
-    flow = np.where(known[:, None], next_pixels - pixels, UNKNOWN_FLOW)
+    flow = next_pixels - pixels
+    with np.errstate(invalid="ignore"):
+        known &= (next_depth > next_camera.near) & (np.abs(flow) < MAX_FLOW).all(axis=1)
+    flow = np.where(known[:, None], flow, UNKNOWN_FLOW)
     return flow.reshape(height, width, 2).astype(np.float32)
 
 

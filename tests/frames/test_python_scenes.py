@@ -241,6 +241,17 @@ def test_flow_of_a_removed_object_is_unknown(scene: ms.Scene, above: ms.Camera) 
     np.testing.assert_allclose(flow[0, 1:], 0, atol=1e-5)
 
 
+def test_flow_beyond_the_range_of_known_flow_is_unknown(above: ms.Camera) -> None:
+    """The distortion of a ray that is almost parallel to the image of the next camera is a huge number."""
+    lens = replace(above, distortion=(-0.1, 0.02, 0.002, -0.003))
+    near, motion = lens.centre + 0.03 * lens.world_from_camera[:3, 2], np.eye(4)
+    middle = lens.unproject([[0.5, 0.5]], [0.2])[0]
+    motion[:3, 3] = near + 3 * lens.world_from_camera[:3, 0] - middle
+    flow = optical_flow(np.full((1, 1), 0.2), lens.cropped(0, 0, 1, 1), lens, np.ones((1, 1), int), {1: motion})
+    assert lens.project(middle[None] + motion[:3, 3])[0].max() > 1e9
+    assert (flow == np.float32(UNKNOWN_FLOW)).all()
+
+
 # Frames
 
 

@@ -93,7 +93,7 @@ def convex_pieces(
 @lru_cache(maxsize=256)
 def _cached_pieces(vertices: bytes, faces: bytes, threshold: float, max_pieces: int) -> tuple[trimesh.Trimesh, ...]:
     libraries = f"{version('coacd')} {version('manifold3d')}"  # of meshes with few faces, and of scans
-    digest = ContentHash("pieces 11", f"{libraries} {threshold!r} {max_pieces}", vertices, faces)
+    digest = ContentHash("pieces 12", f"{libraries} {threshold!r} {max_pieces}", vertices, faces)
     path = cache_folder() / "pieces" / f"{digest.hexdigest()}.npz"
     pieces = _read_pieces(path)
     if pieces is None:

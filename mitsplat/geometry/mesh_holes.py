@@ -17,6 +17,8 @@ _FRAGMENT = 0.001
 """Maximum number of faces of a fragment, relative to those of the mesh."""
 _FLAT = 0.999
 """Area of a hole of three edges, relative to that of its body, above which the body is a flat sheet in this outline."""
+_SAME_ANGLE = 1e-4
+"""Angle below which the sides of a hole coincide [rad], such as those of a face without area."""
 _MAX_EDGES = 400
 """Maximum number of edges of a hole, because the time grows with its square: 2 s for 400 edges."""
 
@@ -104,7 +106,7 @@ def _angles(spokes: Float64Array, normal: Float64Array) -> Float64Array:
     """Return the angles (N,) [rad] about a normal from ``spokes[1:]`` to ``spokes[0]``, anticlockwise from outside."""
     one, others = spokes[0], spokes[1:]
     angles = np.arctan2(np.cross(others, one) @ normal, others @ one - (others @ normal) * (one @ normal))
-    return np.asarray(angles % (2 * np.pi))
+    return np.asarray((angles + _SAME_ANGLE) % (2 * np.pi))
 
 
 def _smallest_area(points: Float64Array) -> float:

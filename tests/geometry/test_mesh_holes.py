@@ -42,6 +42,26 @@ def test_holes_of_neighbouring_triangles_are_closed(seed: int) -> None:
     assert closed.area == pytest.approx(0.06, rel=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_faces_without_area_that_touch_leave_no_holes(seed: int, dtype: type) -> None:
+    """The sides of the hole that such a face leaves have the same direction, apart from rounding errors."""
+    ball = trimesh.creation.icosphere(3, 0.05)
+    vertices, faces = ball.vertices.tolist(), ball.faces.tolist()
+    rng = np.random.default_rng(seed)
+    for face in rng.permutation(len(faces))[:40]:  # gets a vertex on its first side, and a neighbour without area
+        a, b, c = faces[face]
+        middle = len(vertices)
+        vertices.append(np.mean([vertices[a], vertices[b]], axis=0).tolist())
+        faces[face] = [a, middle, c]
+        faces += [[middle, b, c], [a, b, middle]]
+    turned = trimesh.transform_points(vertices, trimesh.transformations.random_rotation_matrix(rng.random(3)))
+    scan = trimesh.Trimesh(turned.astype(dtype), faces, process=False)
+    prepared = prepare_mesh(scan, "ball")
+    assert prepared.is_volume
+    assert prepared.volume == pytest.approx(ball.volume)
+
+
 def test_a_hole_that_is_not_convex_is_closed_within_its_outline() -> None:
     """An L of 18 triangles in a side. A fan from one of its corners would cover more than the hole."""
     box = fine_box()

@@ -176,8 +176,10 @@ def unite_bodies(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     bodies = [[outline] for outline in outlines]
     for cavity in cavities:  # belongs to the smallest body around it
         points = cavity.triangles_center[:: len(cavity.faces) // _POINTS + 1]  # its vertices may touch the body
-        around = (body for body in bodies if points_inside(body[0], points).all())
-        next(around, []).append(cavity)
+        for body in bodies:
+            if points_inside(body[0], points).all():
+                body.append(cavity)
+                break
     united = [_body(*bodies[number]) for number in np.flatnonzero(meets)]
     union = manifold3d.Manifold.batch_boolean(united, manifold3d.OpType.Add)
     apart = [surface for number in np.flatnonzero(~meets) for surface in bodies[number]]

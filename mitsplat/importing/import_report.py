@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from mitsplat.geometry.mesh import mass_properties
 from mitsplat.importing.import_result import Imported
 from mitsplat.pages.html import figure_of, make_figure, make_section, rgb_image, verdict_of, write_report_page
 from mitsplat.reconstruct.asset_evaluation import show_asset
-from mitsplat.storage.files import is_inside, write_text
+from mitsplat.storage.files import is_inside, write_text, yaml_scalar
 
 _VIEW = 420
 _REMOVED_VIEWS = 4
@@ -124,7 +122,7 @@ def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
             float(np.ptp(asset.splats.bounds, axis=0).max()) if asset.mesh is None else float(asset.mesh.extents.max())
         )
         text = _OBJECT_SCENE.format(
-            title=asset.name, name=_quoted(asset.name), asset=_quoted(name),
+            title=asset.name, name=yaml_scalar(asset.name), asset=yaml_scalar(name),
             reach=_metres(1.1 * size), low=_metres(0.1 * size), top=_metres(2.5 * size),
             table=_metres(max(1.2, 8 * size)), target=_metres(0.35 * size), near=_metres(2.8 * size),
             far=_metres(4.2 * size), room=_metres(max(4.0, 16 * size)), walls=_metres(max(7.0, 28 * size)),
@@ -136,23 +134,13 @@ def write_scene(path: Path, asset_folder: Path, imported: Imported) -> None:
         width, depth = imported.support.size
         reach = [min(0.35 * edge, 0.3) for edge in (width, depth)]
         text = _ENVIRONMENT_SCENE.format(
-            title=asset.name, name=_quoted(asset.name), asset=_quoted(name),
+            title=asset.name, name=yaml_scalar(asset.name), asset=yaml_scalar(name),
             width=_metres(width), depth=_metres(depth), x=_metres(reach[0]),
             y=_metres(reach[1]), near=_metres(1.8 * max(reach)), far=_metres(2.8 * max(reach)),
             proxy=", proxy: true" if asset.mesh is None else "",
         )  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, text)
-
-
-def _quoted(text: str) -> str:
-    """Return a text for a scene file: in quotes, unless it is a plain word or path."""
-    plain = re.fullmatch(r"[A-Za-z_./][\w./-]*", text, re.ASCII) and text.lower() not in _YAML_WORDS
-    return text if plain else json.dumps(text, ensure_ascii=False)
-
-
-_YAML_WORDS = frozenset({"true", "false", "yes", "no", "on", "off", "y", "n", "null", "~"})
-"""Words that YAML does not read as text."""
 
 
 def _metres(length: float) -> str:

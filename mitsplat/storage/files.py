@@ -25,6 +25,9 @@ JsonObject = dict[str, Any]
 Record = JsonObject
 """Line of one frame in ``manifest.jsonl``."""
 
+_YAML_WORDS = frozenset({"true", "false", "yes", "no", "on", "off", "y", "n", "null", "~"})
+"""Words that YAML does not read as text."""
+
 SPLITS = ("train", "val", "test")
 """Splits of a dataset. The scene may disable the last one."""
 
@@ -249,6 +252,12 @@ def write_bytes(path: Path, data: bytes) -> str:
 def write_text(path: Path, text: str) -> str:
     """Write UTF-8 text by :func:`write_file`."""
     return write_bytes(path, text.encode())
+
+
+def yaml_scalar(text: str) -> str:
+    """Return a text as it stands in a YAML file: in quotes, unless it is a plain word or path."""
+    plain = re.fullmatch(r"([A-Za-z_/]|\.\.?/)[\w./-]*", text, re.ASCII) and text.lower() not in _YAML_WORDS
+    return text if plain else json.dumps(text, ensure_ascii=False)
 
 
 def files_below(folder: Path, *, skip: Path | None = None) -> list[Path]:

@@ -11,7 +11,7 @@ import numpy as np
 from mitsplat.arrays import Float64Array
 from mitsplat.geometry.camera import Camera
 from mitsplat.reconstruct.asset_evaluation import VERDICT_FILE
-from mitsplat.storage.files import write_text
+from mitsplat.storage.files import write_text, yaml_scalar
 from mitsplat.surroundings.supports import Support
 
 _MARGIN = 0.05
@@ -56,8 +56,9 @@ def scene_text(name: str, supports: Sequence[Support], free: Rectangle, cameras:
         for number, s in enumerate(supports)
     )
     return _SCENE.format(
-        name=_quoted(name), folder=_FOLDER, boxes=boxes, x0=_length(x0), x1=_length(x1), y0=_length(y0), y1=_length(y1),
-        margin=_length(margin), tx=_length(target[0]), ty=_length(target[1]), near=_length(near), far=_length(far),
+        name=yaml_scalar(name), folder=_FOLDER, boxes=boxes, margin=_length(margin),
+        x0=_length(x0), x1=_length(x1), y0=_length(y0), y1=_length(y1),
+        tx=_length(target[0]), ty=_length(target[1]), near=_length(near), far=_length(far),
         low=f"{low:.0f}", high=f"{high:.0f}", start=f"{start:.0f}", end=f"{end:.0f}", fov=f"{min(fov, 120):.0f}",
     )  # fmt: skip
 
@@ -83,11 +84,6 @@ def _surface_name(number: int) -> str:
     return "support" if number == 0 else f"surface{number}"
 
 
-def _quoted(text: str) -> str:
-    """Return a text as a scalar of YAML, which may look like a number or contain a comment sign."""
-    return json.dumps(text, ensure_ascii=False)
-
-
 def _length(length: float) -> str:
     """Format a length to a tenth of a millimetre."""
     return f"{round(float(length), 4) + 0.0:g}"
@@ -99,7 +95,7 @@ def recorded_scene(out: Path) -> str | None:
         scene = json.loads((out / VERDICT_FILE).read_text()).get("scene")
     except (OSError, ValueError, AttributeError):
         return None
-    return scene.replace(_FOLDER, _quoted(out.resolve().name)) if isinstance(scene, str) else None
+    return scene.replace(_FOLDER, yaml_scalar(out.resolve().name)) if isinstance(scene, str) else None
 
 
 def write_recorded_scene(out: Path, earlier: str | None) -> tuple[Path | None, str | None]:

@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from ruamel.yaml import YAML
 
 from mitsplat.errors import InputError
+from mitsplat.storage.files import yaml_scalar
 from mitsplat.storage.yaml_input import FieldError, key_place, load_yaml
 
 
@@ -195,3 +197,10 @@ def test_numbers_that_would_overflow_are_refused(tmp_path: Path, number: str, go
         load_yaml(path, Drawing)
     rule = f"numbers must be from -1e+30 to 1e+30 (got {got})"
     assert str(raised.value) == f"{path}:3: shapes[0].radius: {rule}"
+
+
+@pytest.mark.parametrize(
+    "text", ["cell", "./a-b/c_1.d", "../x", "cell #2", ".5", ".inf", "007", "1e5", "Yes", "~", "a: b", "", "Zürich"]
+)
+def test_a_written_text_is_read_as_the_same_text(text: str) -> None:
+    assert YAML(typ="safe").load(f"{{name: {yaml_scalar(text)}}}") == {"name": text}

@@ -25,7 +25,7 @@ from mitsplat.findings import Finding
 from mitsplat.formats.registry import Catalogue
 from mitsplat.geometry.coplanar import coplanar_place
 from mitsplat.geometry.mesh import closed_solid
-from mitsplat.geometry.solids import is_closed
+from mitsplat.geometry.solids import is_closed, signed_volume
 from mitsplat.physics.settle import try_alone, warp_settings
 from mitsplat.reconstruct.registration import measure_offset
 from mitsplat.reconstruct.segment_splats import find_floaters, long_needles, visible_area
@@ -239,7 +239,7 @@ def _mass(asset: Asset, mesh: trimesh.Trimesh) -> Iterator[Finding]:
     """Check the density that follows from the mass of an object and the volume of its mesh."""
     try:
         pieces = asset.pieces or (mesh.convex_hull,)
-        volume = abs(float(np.linalg.det(closed_solid(mesh, pieces).triangles).sum())) / 6
+        volume = abs(signed_volume(closed_solid(mesh, pieces)))
     except QhullError:
         volume = 0.0
     if not 0 < volume < np.inf:
